@@ -1,0 +1,107 @@
+"""The four barriers behind one interface: phi, L_f phi, L_g phi for every row of a safety function.
+
+========== ================================ ==========================================================
+LB-CBF     ``phi = ḣ + gamma h``            blind to torque limits and passivity (eq. 10)
+NCBF       ``phi = ḣ + gamma h - K_theta``  K trained for torque limits (eq. 11, 25)
+PP-NCBF    ``phi = ḣ + gamma h - K_theta``  K trained for torque limits and passivity
+PP-CBF     ``phi = alpha_pp h - ½ vᵀ M v``  Califano's, enforced as ``phi̇ >= -gamma_K phi``
+========== ================================ ==========================================================
+
+With ``w = ∇_v phi``: ``L_g phi = wᵀ M⁻¹`` and ``psi(x, u) = phi̇ = L_f phi + L_g phi u``. phi of the first three is in
+m/s, of the last in J.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from ppcbf_robots.network import NumpyNetwork
+from ppcbf_robots.robot import Dynamics, RobotModel
+from ppcbf_robots.safety import SafetyRows
+from ppcbf_robots.specs import Array, BarrierSpec
+
+BarrierKind = Literal["lb-cbf", "ncbf", "pp-ncbf", "pp-cbf"]
+
+
+@dataclass(frozen=True)
+class BarrierRows:
+    """Values of all rows of a barrier at one state; leading batch axes are allowed."""
+
+    h: Any  # (..., rows)
+    phi: Any  # (..., rows)
+    Lf_phi: Any  # (..., rows)
+    Lg_phi: Any  # (..., rows, nv)
+    w: Any  # (..., rows, nv) = ∇_v phi, so that Lg_phi = wᵀ M⁻¹
+
+    def psi(self, u: Any) -> Any:
+        """phi̇ under torque u (..., nv): (..., rows)."""
+        return self.Lf_phi + (self.Lg_phi * u[..., None, :]).sum(-1)
+
+
+def rho_rows(
+    h: Any, grad: Any, curvature: Any, v: Any, Minv: Any, b: Any, gamma: float, K: Any, K_q_rate: Any, K_v: Any
+) -> BarrierRows:
+    """Rows of ``phi = ḣ + gamma h - K`` for numpy or torch arrays.
+
+    K (...), K_q_rate (...) = ∂K/∂q · q̇, K_v (..., nv) = ∂K/∂v; b = C v + g.
+    """
+    hdot = (grad * v[..., None, :]).sum(-1)
+    w = grad - K_v[..., None, :]
+    Lg_phi = w @ Minv
+    Lf_phi = curvature + gamma * hdot - K_q_rate[..., None] - (Lg_phi * b[..., None, :]).sum(-1)
+    return BarrierRows(h, hdot + gamma * h - K[..., None], Lf_phi, Lg_phi, w)
+
+
+class Barrier(Protocol):
+    """What a filter needs of a barrier."""
+
+    kind: BarrierKind
+    spec: BarrierSpec
+
+    def rows(self, dyn: Dynamics, safety: SafetyRows) -> BarrierRows:
+        """All rows at one state (or batch)."""
+        ...
+
+
+class RhoBarrier:
+    """LB-CBF (no network), NCBF and PP-NCBF."""
+
+    def __init__(
+        self, kind: BarrierKind, robot: RobotModel, spec: BarrierSpec, network: NumpyNetwork | None = None
+    ) -> None:
+        self.kind, self.robot, self.spec, self.network = kind, robot, spec, network
+
+    def rows(self, dyn: Dynamics, safety: SafetyRows) -> BarrierRows:
+        """Eq. (10), (11), (25) of the paper."""
+        if self.network is None:
+            K = K_q_rate = np.zeros(dyn.v.shape[:-1])
+            K_v = np.zeros_like(dyn.v)
+        else:
+            K, K_q, K_v = self.network.value_and_grad(dyn.q, dyn.v)
+            K_q_rate = (K_q * self.robot.q_rate(dyn.q, dyn.v)).sum(-1)
+        return rho_rows(
+            safety.h, safety.grad, safety.curvature, dyn.v, dyn.Minv, dyn.b, self.spec.gamma, K, K_q_rate, K_v
+        )
+
+
+class EnergyBarrier:
+    """PP-CBF of Califano (arXiv:2303.10981), one row per safety function."""
+
+    kind: BarrierKind = "pp-cbf"
+
+    def __init__(self, spec: BarrierSpec) -> None:
+        self.spec = spec
+
+    def rows(self, dyn: Dynamics, safety: SafetyRows) -> BarrierRows:
+        """``phi = alpha h - T`` and ``d/dt ½ vᵀ M v = vᵀ (u - g)``, so ``L_g phi = -vᵀ``."""
+        alpha = self.spec.alpha_pp
+        v = dyn.v[..., None, :]
+        hdot = (safety.grad * v).sum(-1)
+        Lf_phi = alpha * hdot + (dyn.v * dyn.g).sum(-1)[..., None]
+        Lg_phi: Array = np.broadcast_to(-v, safety.grad.shape)
+        Mv = (dyn.M @ dyn.v[..., None])[..., 0]
+        w = np.broadcast_to(-Mv[..., None, :], safety.grad.shape)
+        return BarrierRows(safety.h, alpha * safety.h - dyn.kinetic_energy[..., None], Lf_phi, Lg_phi, w)

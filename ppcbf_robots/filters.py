@@ -1,0 +1,229 @@
+"""Torque corrections: the paper's closed form (8)/(13), and the QP with all its rows.
+
+``u = u_des + δ``. The metric W decides how δ is measured: ``torque`` is the paper's W = I; ``kinetic`` is W = M⁻¹ (Gauss'
+principle of least constraint), whose correction ``δ = Σ λ_k w_k`` acts like contact forces and takes energy out wherever
+K_theta is convex in v.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+
+from ppcbf_robots.barriers import Barrier, BarrierRows
+from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
+from ppcbf_robots.robot import Dynamics
+from ppcbf_robots.specs import Array
+
+Metric = Literal["torque", "kinetic"]
+FilterKind = Literal["closed-form", "qp"]
+
+_TINY = 1e-12
+ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
+LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
+
+
+class Status(IntEnum):
+    """What the filter did in one step; stored in trajectories as its number."""
+
+    FREE = 0  # u_des passed unchanged
+    CORRECTING = 1  # at least one constraint changed the torque
+    RESTING = 2  # correcting while the arm stands still against an obstacle or limit
+    PASSIVITY_DROPPED = 3  # rows and box hold only without the passivity row: energy may enter
+    INFEASIBLE = 4  # no torque in the box satisfies all rows: the least violation was applied
+    FAULT = 5  # no usable answer for a valid state: damping and gravity compensation only
+    INVALID = 6  # state not usable: gravity torque of the last valid state
+    STOP = 7  # state invalid for too long: engage the brakes
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """Settings of a filter; the defaults are the recommended runtime filter."""
+
+    kind: FilterKind = "qp"
+    metric: Metric = "kinetic"
+    solver: str = "proxqp"
+    alpha: float = 10.0  # [1/s], class-K gain of the QP's rows: psi >= -alpha (phi - margin)
+    margin: float = 1e-3  # [m/s], phi kept above by the QP, for the control period's discretisation
+    near_rows: int = 10  # rows handed to the QP; the rest are checked afterwards
+    max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
+    dt: float = 1e-3  # [s], control period
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A filtered torque and why it is what it is."""
+
+    u: Array  # (nv,)
+    status: Status
+    reason: str
+    row: int  # index of the row that decided, -1 if none
+
+
+class ClosedForm:
+    """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
+
+    def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
+        self.barrier, self.config = barrier, config
+
+    def _active(self, rows: BarrierRows) -> Array:
+        spec = self.barrier.spec
+        if spec.act_within is not None:
+            return np.asarray(rows.h <= spec.act_within)
+        if self.barrier.kind == "pp-cbf":
+            return np.ones_like(rows.h, dtype=bool)
+        return np.asarray(rows.phi <= spec.epsilon)
+
+    def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
+        """The paper's correction; d_p and u_max do not enter it."""
+        active = np.flatnonzero(self._active(rows))
+        if not active.size:
+            return Correction(u_des, Status.FREE, "outside the band", -1)
+        k = int(active[np.argmin(rows.phi[active])])
+        Lg = rows.Lg_phi[k]
+        residual = float(rows.Lf_phi[k] + Lg @ u_des)  # psi(x, u_des)
+        if self.barrier.kind == "pp-cbf":
+            residual += self.barrier.spec.gamma_K * float(rows.phi[k])
+        if residual >= 0.0:
+            return Correction(u_des, Status.FREE, "psi(u_des) >= 0", -1)
+        direction = Lg if self.config.metric == "torque" else rows.w[k]
+        gain = float(Lg @ direction)
+        multiplier = -residual / max(gain, _TINY)
+        if self.barrier.kind == "pp-cbf":
+            multiplier = min(multiplier, self._stopping_gain(dyn))
+        elif gain < _TINY:
+            return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
+        return Correction(u_des + multiplier * direction, Status.CORRECTING, "psi(u_des) < 0", k)
+
+    def _stopping_gain(self, dyn: Dynamics) -> float:
+        """The largest gain of the damper -multiplier v (or -multiplier M v) that does not reverse v within one period.
+
+        The PP-CBF's L_g phi = -vᵀ vanishes at rest, where the formula divides by |v|² and chatters.
+        """
+        if self.config.metric == "kinetic":
+            return 1.0 / self.config.dt
+        return 1.0 / (self.config.dt * float(np.linalg.eigvalsh(dyn.Minv)[-1]))
+
+
+class QPFilter:
+    """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
+
+    Rows are ``psi_k(u) >= -alpha (phi_k - margin)`` (PP-CBF: alpha = gamma_K, no margin) and ``vᵀ δ <= d_p``. The near
+    rows are those closest to violation by u_des, each in units of the correction it needs; the others are checked
+    afterwards and join if they are violated, so the answer satisfies all rows.
+    """
+
+    def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
+        self.barrier, self.config = barrier, config
+        self.solver: QPSolver = make_solver(config.solver)
+        self._last_rows: Array | None = None
+
+    def _slack(self, rows: BarrierRows, u_des: Array) -> Array:
+        """Left side of every row at δ = 0; the row holds there if it is >= 0."""
+        if self.barrier.kind == "pp-cbf":
+            return np.asarray(rows.psi(u_des) + self.barrier.spec.gamma_K * rows.phi)
+        return np.asarray(rows.psi(u_des) + self.config.alpha * (rows.phi - self.config.margin))
+
+    def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
+        """The least correction in the configured metric, checked before it is returned."""
+        slack = self._slack(rows, u_des)
+        inside = bool(np.all(np.abs(u_des) <= u_max))
+        if inside and np.all(slack >= 0.0):
+            return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
+        C = rows.Lg_phi * u_max
+        norms = np.sqrt((C * C).sum(-1))
+        usable = norms > 1e-9
+        scale = np.maximum(norms, 1e-9)
+        C, lower = C / scale[:, None], -slack / scale
+        if np.any(~usable & (slack < -1e-9)):
+            k = int(np.argmin(np.where(usable, np.inf, slack)))
+            z = self._least_violation(dyn, C[usable], lower[usable], u_des, u_max)
+            return self._answer(z, u_des, u_max, Status.INFEASIBLE, "L_g phi is zero on a violated row", k)
+        passivity = self._passivity_row(dyn, d_p, u_max)
+        for row, status, reason in (
+            (passivity, Status.CORRECTING, "constraint active"),
+            (None, Status.PASSIVITY_DROPPED, "rows and box allow no passive torque"),
+        ):
+            if row is None and passivity is None and status is Status.PASSIVITY_DROPPED:
+                continue
+            z = self._solve(dyn, C, lower, usable, row, u_des, u_max)
+            if z is not None:
+                return self._answer(z, u_des, u_max, status, reason, self._tightest(C, lower, z))
+        z = self._least_violation(dyn, C[usable], lower[usable], u_des, u_max)
+        k = int(np.argmax(lower))
+        return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
+
+    @staticmethod
+    def _tightest(C: Array, lower: Array, z: Array) -> int:
+        residual = C @ z - lower
+        k = int(np.argmin(residual))
+        return k if residual[k] < 1e-4 else -1
+
+    @staticmethod
+    def _passivity_row(dyn: Dynamics, d_p: float | None, u_max: Array) -> tuple[Array, float] | None:
+        """vᵀ δ <= d_p as (row, lower) of length 1; None where it constrains nothing."""
+        if d_p is None:
+            return None
+        row = -dyn.v * u_max
+        norm = float(np.sqrt(row @ row))
+        return None if norm < 1e-9 else (row / norm, -d_p / norm)
+
+    def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
+        n = len(u_max)
+        weight = np.eye(n) if self.config.metric == "torque" else dyn.Minv
+        H = weight * np.outer(u_max, u_max)
+        return np.asarray(H * (n / np.trace(H)))
+
+    def _solve(
+        self,
+        dyn: Dynamics,
+        C: Array,
+        lower: Array,
+        usable: Array,
+        passivity: tuple[Array, float] | None,
+        u_des: Array,
+        u_max: Array,
+    ) -> Array | None:
+        H = self._hessian(dyn, u_max)
+        box = (-1.0 - u_des / u_max, 1.0 - u_des / u_max)
+        ranked = np.argsort(np.where(usable, -lower, np.inf), kind="stable")
+        chosen = np.sort(ranked[: min(self.config.near_rows, int(usable.sum()))])
+        for _ in range(4):
+            rows, bounds = C[chosen], lower[chosen]
+            if passivity is not None:
+                rows, bounds = np.vstack([rows, passivity[0]]), np.append(bounds, passivity[1])
+            same = self._last_rows is not None and np.array_equal(chosen, self._last_rows)
+            self._last_rows = chosen
+            z = self.solver.solve(QPProblem(H, np.zeros(len(H)), rows, bounds, *box, same_rows=same))
+            if z is None or not np.all(np.isfinite(z)):
+                return None
+            z = np.clip(z, *box)
+            if np.any(rows @ z < bounds - ROW_TOLERANCE * np.maximum(1.0, np.abs(bounds))):
+                return None
+            missed = np.flatnonzero(usable & (C @ z < lower - ROW_TOLERANCE * np.maximum(1.0, np.abs(lower))))
+            if not missed.size:
+                return z
+            chosen = np.union1d(chosen, missed[np.argsort((C @ z - lower)[missed])][: self.config.near_rows])
+        return None
+
+    def _least_violation(self, dyn: Dynamics, C: Array, lower: Array, u_des: Array, u_max: Array) -> Array | None:
+        """Torque in the box with the least worst violation: one slack shared by all rows, heavily weighted."""
+        n = len(u_max)
+        near = np.sort(np.argsort(-lower, kind="stable")[: self.config.near_rows])
+        H = np.zeros((n + 1, n + 1))
+        H[:n, :n] = self._hessian(dyn, u_max)
+        H[n, n] = LEAST_VIOLATION_WEIGHT
+        rows = np.hstack([C[near], np.ones((len(near), 1))])
+        box_low = np.append(-1.0 - u_des / u_max, 0.0)
+        box_high = np.append(1.0 - u_des / u_max, 1e6)
+        z = self.solver.solve(QPProblem(H, np.zeros(n + 1), rows, lower[near], box_low, box_high))
+        return None if z is None or not np.all(np.isfinite(z)) else np.clip(z[:n], box_low[:n], box_high[:n])
+
+    @staticmethod
+    def _answer(z: Array | None, u_des: Array, u_max: Array, status: Status, reason: str, row: int) -> Correction:
+        if z is None:
+            return Correction(u_des, Status.FAULT, "the QP solver gave no usable answer", row)
+        return Correction(np.clip(u_des + z * u_max, -u_max, u_max), status, reason, row)

@@ -1,0 +1,1 @@
+"""Training of barriers: the only package, besides proofs, that imports torch."""

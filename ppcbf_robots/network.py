@@ -1,0 +1,112 @@
+"""The learned term K_theta(q, v) >= 0 with its exact gradient, in one implementation for numpy and torch.
+
+Every function takes the array module as ``xp`` (numpy at run time, torch in training and export), so the runtime needs
+no torch and cannot drift from what was trained. q stands for Pinocchio's coordinates (cos and sin of continuous joints).
+
+Two forms:
+
+* ``mlp``: the paper's perceptron with ELU units and squared output, made zero at rest,
+  ``K = (f(q, v) - f(q, 0))²`` (``zero_at_rest = 0`` gives the paper's letter, ``f²``).
+* ``convex``: ``K = Σ_j a_j(q) D_j``, where D_j is the Bregman divergence of ``z -> softplus(z + c_j(q))`` between 0 and
+  ``z_j = b_j(q) · v / v_scale``, with ``a_j >= 0``. It is smooth, zero with zero gradient at rest and convex in v, so
+  ``v · ∂K/∂v >= K >= 0``: the corrections of the kinetic metric dissipate (see the README's theory section).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+NetworkKind = Literal["mlp", "convex"]
+Params = Mapping[str, Any]
+
+
+def _elu(xp: Any, x: Any) -> tuple[Any, Any]:
+    """ELU and its derivative; exp only of the negative part, so that nothing overflows."""
+    e = xp.exp(xp.where(x > 0, xp.zeros_like(x), x))
+    return xp.where(x > 0, x, e - 1.0), e
+
+
+def _hidden(xp: Any, p: Params, x: Any) -> tuple[Any, list[Any]]:
+    slopes = []
+    i = 0
+    while f"W{i}" in p:
+        x, slope = _elu(xp, x @ p[f"W{i}"] + p[f"b{i}"])
+        slopes.append(slope)
+        i += 1
+    return x, slopes
+
+
+def _pull_back(p: Params, g: Any, slopes: list[Any]) -> Any:
+    """Gradient with respect to the input from the gradient g with respect to the last hidden layer."""
+    for i in reversed(range(len(slopes))):
+        g = (g * slopes[i]) @ p[f"W{i}"].T
+    return g
+
+
+def _sigmoid(xp: Any, x: Any) -> Any:
+    return 0.5 * (1.0 + xp.tanh(0.5 * x))
+
+
+def _softplus(xp: Any, x: Any) -> Any:
+    return xp.log1p(xp.exp(-xp.abs(x))) + xp.where(x > 0, x, xp.zeros_like(x))
+
+
+def _mlp(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
+    nq = q.shape[-1]
+    scale = p["in_scale"]
+
+    def f(v: Any) -> tuple[Any, Any]:
+        x, slopes = _hidden(xp, p, (xp.concatenate([q, v], -1) - p["in_shift"]) * scale)
+        out = x @ p["w_out"]
+        g = xp.zeros_like(x) + p["w_out"]
+        return out, _pull_back(p, g, slopes) * scale
+
+    y, dy = f(v)
+    y0, dy0 = f(xp.zeros_like(v))
+    rest = p["zero_at_rest"]
+    d = y + (1.0 - rest) * p["b_out"] - rest * y0
+    two_d = 2.0 * d[..., None]
+    return d * d, two_d * (dy[..., :nq] - rest * dy0[..., :nq]), two_d * dy[..., nq:]
+
+
+def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
+    x, slopes = _hidden(xp, p, (q - p["in_shift"]) * p["in_scale"])
+    units = p["ba"].shape[-1]
+    ra = x @ p["Wa"] + p["ba"]
+    a = _softplus(xp, ra)
+    c = x @ p["Wc"] + p["bc"]
+    b = (x @ p["Wb"] + p["bb"]).reshape(*x.shape[:-1], units, v.shape[-1])  # (..., units, nv)
+    s = v * p["v_scale"]
+    z = (b * s[..., None, :]).sum(-1)
+    sig, sig0 = _sigmoid(xp, z + c), _sigmoid(xp, c)
+    D = _softplus(xp, z + c) - _softplus(xp, c) - sig0 * z
+    K = (a * D).sum(-1)
+    dz = a * (sig - sig0)  # dK/dz
+    dc = dz - a * sig0 * (1.0 - sig0) * z
+    dK_dv = (dz[..., None] * b).sum(-2) * p["v_scale"]
+    db = (dz[..., None] * s[..., None, :]).reshape(*x.shape[:-1], -1)
+    g = (D * _sigmoid(xp, ra)) @ p["Wa"].T + dc @ p["Wc"].T + db @ p["Wb"].T
+    return K, _pull_back(p, g, slopes) * p["in_scale"], dK_dv
+
+
+_FORMS = {"mlp": _mlp, "convex": _convex}
+
+
+def value_and_grad(xp: Any, kind: NetworkKind, params: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
+    """K (...), ∂K/∂q (..., nq) in Pinocchio's coordinates, ∂K/∂v (..., nv), for q (..., nq) and v (..., nv)."""
+    return _FORMS[kind](xp, params, q, v)
+
+
+class NumpyNetwork:
+    """K_theta for the runtime: float64 numpy parameters, no torch."""
+
+    def __init__(self, kind: NetworkKind, params: Mapping[str, Any]) -> None:
+        self.kind: NetworkKind = kind
+        self.params = {k: np.asarray(w, dtype=np.float64) for k, w in params.items()}
+
+    def value_and_grad(self, q: Any, v: Any) -> tuple[Any, Any, Any]:
+        """See :func:`value_and_grad`."""
+        return value_and_grad(np, self.kind, self.params, q, v)

@@ -1,0 +1,109 @@
+"""The filter's quadratic program, apart from who solves it.
+
+``min ½ zᵀ H z + gᵀ z  s.t.  C z >= lower,  box_low <= z <= box_high`` in the dimensionless correction z = δ / u_max, with rows
+of C of length 1. Solvers return ``None`` unless they claim an optimum; the filter checks the claim itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from proxsuite import proxqp
+
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.specs import Array
+
+NO_BOUND = 1e20  # ProxQP's infinity
+
+
+class QPProblem(NamedTuple):
+    """One QP; see the module's formula."""
+
+    H: Array  # (n, n)
+    g: Array  # (n,)
+    C: Array  # (m, n)
+    lower: Array  # (m,)
+    box_low: Array  # (n,)
+    box_high: Array  # (n,)
+    same_rows: bool = False  # whether the rows are those of the last problem, so that its solution is a good start
+
+
+class QPSolver(Protocol):
+    """Solves one QP; None when no optimum was found."""
+
+    def solve(self, problem: QPProblem) -> Array | None:
+        """(n,) solution or None."""
+        ...
+
+
+class ProxQPSolver:
+    """ProxQP, dense, updated in place; one workspace per problem size.
+
+    Warm starts from the last solution are used only while the rows stay the same: across a change of rows they can
+    report a feasible problem as infeasible.
+    """
+
+    def __init__(self, eps: float = 1e-8, max_iter: int = 300) -> None:
+        self.eps, self.max_iter = eps, max_iter
+        self._workspaces: dict[tuple[int, int], Any] = {}
+
+    def solve(self, problem: QPProblem) -> Array | None:
+        """(n,) solution, or None unless ProxQP ends with PROXQP_SOLVED."""
+        m, n = problem.C.shape
+        qp = self._workspaces.get((n, m))
+        arguments = (
+            problem.H,
+            problem.g,
+            None,
+            None,
+            problem.C,
+            problem.lower,
+            np.full(m, NO_BOUND),
+            problem.box_low,
+            problem.box_high,
+        )
+        guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS
+        if qp is None:
+            qp = proxqp.dense.QP(n, 0, m, True, proxqp.dense.HessianType.Dense)
+            qp.settings.eps_abs, qp.settings.eps_rel = self.eps, 0.0
+            qp.settings.max_iter, qp.settings.compute_timings = self.max_iter, False
+            qp.settings.initial_guess = guess
+            qp.init(*arguments)
+            self._workspaces[(n, m)] = qp
+        else:
+            if problem.same_rows and qp.results.info.status == proxqp.QPSolverOutput.PROXQP_SOLVED:
+                guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+            qp.settings.initial_guess = guess
+            qp.update(*arguments)
+        qp.solve()
+        if qp.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
+            return None
+        return np.array(qp.results.x)
+
+
+class QPSolversSolver:
+    """Any dense solver installed for the qpsolvers package, by name (``daqp``, ``quadprog``, ...)."""
+
+    def __init__(self, name: str) -> None:
+        import qpsolvers
+
+        if name not in qpsolvers.available_solvers:
+            available = ", ".join(qpsolvers.available_solvers)
+            raise InputError(f"QP solver '{name}' is not installed (available: {available}); pip install it")
+        self._name, self._qpsolvers = name, qpsolvers
+
+    def solve(self, problem: QPProblem) -> Array | None:
+        """(n,) solution or None."""
+        p = problem
+        qp = self._qpsolvers.Problem(p.H, p.g, -p.C, -p.lower, lb=p.box_low, ub=p.box_high)
+        try:
+            solution = self._qpsolvers.solve_problem(qp, solver=self._name)
+        except (self._qpsolvers.exceptions.SolverError, ValueError):
+            return None
+        return np.asarray(solution.x) if solution.found and solution.x is not None else None
+
+
+def make_solver(name: str) -> QPSolver:
+    """``proxqp`` directly through proxsuite, everything else through qpsolvers."""
+    return ProxQPSolver() if name == "proxqp" else QPSolversSolver(name)

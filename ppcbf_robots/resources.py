@@ -1,0 +1,69 @@
+"""Where things are: bundled robots and worlds, and the URDFs of example-robot-data."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from importlib.resources import files
+from pathlib import Path
+
+from ppcbf_robots.errors import InputError
+
+
+def bundled(folder: str, suffix: str = ".yaml") -> dict[str, Path]:
+    """Bundled files by name; ``folder`` is 'robots' or 'obstacles'."""
+    root = Path(str(files(f"ppcbf_robots.{folder}")))
+    return {p.stem: p for p in sorted(root.glob(f"*{suffix}"))}
+
+
+def find_robot(name: str) -> Path:
+    """Path of a robot: a file as given, a bundled spec, or a URDF of example-robot-data.
+
+    Raises:
+        InputError: if nothing by that name exists.
+    """
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml", ".urdf", ".xml"):
+        if path.is_file():
+            return path
+        raise InputError(f"robot file not found: {path}")
+    specs = bundled("robots")
+    if name in specs:
+        return specs[name]
+    example = _example_urdfs()
+    for candidate in (name, f"{name}_robot"):
+        if candidate in example:
+            return example[candidate]
+    raise InputError(
+        f"no robot named '{name}': give a URDF or YAML path, a bundled name ({', '.join(specs)}), "
+        "or the name of a URDF in example-robot-data, such as ur5, z1 or xarm7"
+    )
+
+
+def find_world(name: str) -> Path:
+    """Path of an obstacle spec: a file as given, or a bundled name; InputError if neither."""
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml"):
+        if path.is_file():
+            return path
+        raise InputError(f"obstacle file not found: {path}")
+    worlds = bundled("obstacles")
+    if name in worlds:
+        return worlds[name]
+    raise InputError(f"no world named '{name}': give a YAML path or a bundled name ({', '.join(worlds)})")
+
+
+def _example_urdfs() -> dict[str, Path]:
+    try:
+        distribution = importlib.metadata.distribution("example-robot-data")
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    found = [f for f in distribution.files or [] if str(f).endswith(".urdf")]
+    return {f.stem: Path(str(distribution.locate_file(f))).resolve() for f in found}
+
+
+def default_package_dirs(urdf: Path) -> list[Path]:
+    """Folders against which ``package://`` is tried: around the URDF and example-robot-data's share."""
+    around = list(urdf.resolve().parents)[:5]
+    example = _example_urdfs()
+    share = next((p for path in example.values() for p in path.parents if p.name == "share"), None)
+    return around + ([share] if share else [])

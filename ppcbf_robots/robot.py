@@ -1,0 +1,315 @@
+"""Fixed-base robots through Pinocchio: kinematics and dynamics at (q, v) as one immutable evaluation.
+
+Conventions: q (nq,) is Pinocchio's configuration, where a continuous joint is stored as (cos, sin); v (nv,) is the
+joint velocity [rad/s | m/s]; torque u (nv,) [N m | N]; ``M(q) a + C(q, v) v + g(q) = u``. Positions are in metres in
+the base frame. Every array of an evaluation may carry a leading batch axis.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, per_joint, vector
+from ppcbf_robots.urdf import check_urdf
+
+_SKEW = np.zeros((3, 3, 3))  # p @ _SKEW = [p]x, the matrix of p x (.)
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _SKEW[_k, _i, _j], _SKEW[_k, _j, _i] = -1.0, 1.0
+_SKEW = _SKEW.reshape(3, 9)
+
+PD_RELATIVE_FLOOR = 1e-10  # least over largest eigenvalue of M below which M counts as singular
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Everything the method needs at one (q, v); arrays are read-only.
+
+    J is the spatial Jacobian in the base frame at its origin, rows (linear, angular); dJ is its time derivative.
+    """
+
+    q: Array  # (..., nq)
+    v: Array  # (..., nv)
+    M: Array  # (..., nv, nv) mass matrix
+    Minv: Array  # (..., nv, nv)
+    Cv: Array  # (..., nv) Coriolis and centrifugal torque C(q, v) v
+    g: Array  # (..., nv) gravity torque
+    placements: Array  # (..., joints, 4, 4) of the moving joints
+    J: Array  # (..., 6, nv)
+    dJ: Array  # (..., 6, nv)
+
+    @property
+    def b(self) -> Array:
+        """Bias torque ``C v + g``, (..., nv)."""
+        return self.Cv + self.g
+
+    @property
+    def kinetic_energy(self) -> Array:
+        """½ vᵀ M v [J], (...)."""
+        return np.asarray(0.5 * np.einsum("...i,...ij,...j->...", self.v, self.M, self.v))
+
+
+@dataclass(frozen=True)
+class PointKinematics:
+    """Positions of body points with first and second order terms: ṗ = J v, p̈ = J a + Jdot_v."""
+
+    p: Array  # (..., points, 3)
+    J: Array  # (..., points, 3, nv)
+    Jdot_v: Array  # (..., points, 3)
+
+
+class BodyPoints:
+    """Points fixed to moving joints (parent joint, offset in the joint's frame [m])."""
+
+    def __init__(self, robot: RobotModel, joints: Sequence[int], offsets: Array) -> None:
+        self.joints = np.asarray(joints, dtype=int)
+        self.offsets = np.concatenate([np.asarray(offsets, float).reshape(-1, 3), np.ones((len(self.joints), 1))], axis=1)
+        self.mask = robot.ancestors[self.joints]  # (points, nv): which joints move which point
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def kinematics(self, dyn: Dynamics) -> PointKinematics:
+        """Position, Jacobian and J̇ v of every point; leading batch axes follow ``dyn``."""
+        T = dyn.placements[..., self.joints, :, :]
+        p = (T[..., :3, :] @ self.offsets[..., None])[..., 0]
+        skew = (p @ _SKEW).reshape(*p.shape[:-1], 3, 3)
+        lin, ang = dyn.J[..., None, :3, :], dyn.J[..., None, 3:, :]
+        mask = self.mask[:, None, :]
+        J = (lin - skew @ ang) * mask
+        v = dyn.v[..., None, :, None]
+        omega = ((ang * mask) @ v)[..., 0]
+        a_lin = ((dyn.dJ[..., None, :3, :] * mask) @ v)[..., 0]
+        a_ang = (dyn.dJ[..., None, 3:, :] * mask) @ v
+        velocity = J @ v
+        omega_skew = (omega @ _SKEW).reshape(*p.shape[:-1], 3, 3)
+        Jdot_v = a_lin - (skew @ a_ang)[..., 0] + (omega_skew @ velocity)[..., 0]
+        return PointKinematics(p, J, Jdot_v)
+
+
+class RobotModel:
+    """A fixed-base robot whose moving joints all have one degree of freedom.
+
+    Args:
+        urdf: path of the URDF.
+        package_dirs: folders against which ``package://`` is resolved (meshes only; the dynamics need none).
+        locked: joints held at a position, by name [rad | m].
+        effort: torque limits, overriding the URDF's [N m | N].
+        velocity: velocity limits, overriding the URDF's [rad/s | m/s].
+        payload: a point mass added to a frame.
+
+    Raises:
+        InputError: for every URDF or override the method cannot use, with the reason and the remedy.
+    """
+
+    def __init__(
+        self,
+        urdf: Path,
+        package_dirs: Sequence[Path] = (),
+        locked: Mapping[str, float] | None = None,
+        effort: PerJoint | None = None,
+        velocity: PerJoint | None = None,
+        payload: PayloadSpec | None = None,
+    ) -> None:
+        self.urdf = Path(urdf)
+        self.package_dirs = [Path(p) for p in package_dirs]
+        self.warnings: list[str] = []
+        facts = check_urdf(self.urdf)
+        self.name = facts.name
+        self.urdf_sha256 = hashlib.sha256(self.urdf.read_bytes()).hexdigest()
+        try:
+            self.full_model = pin.buildModelFromUrdf(str(self.urdf))
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"{self.urdf}: Pinocchio cannot read it ({' '.join(str(error).split())})") from None
+        self.locked = self._locked(dict(locked or {}), facts.mimic_joints)
+        self.reference = self._reference()
+        ids = [self.full_model.getJointId(n) for n in self.locked]
+        self.model = pin.buildReducedModel(self.full_model, ids, self.reference) if ids else self.full_model
+        if self.model.nv == 0:
+            raise InputError(f"{self.urdf}: no joint moves; check 'locked' and the joint types")
+        self.joint_names = list(self.model.names)[1:]
+        self._check_joint_types()
+        if payload is not None:
+            self._add_payload(payload)
+        self.data = self.model.createData()
+        self.nq, self.nv = int(self.model.nq), int(self.model.nv)
+        self._index_joints()
+        self.u_max = self._limits("effort", self.model.upperEffortLimit, effort)
+        self.v_max = self._limits("velocity", self.model.upperVelocityLimit, velocity)
+
+    def _locked(self, locked: dict[str, float], mimics: Sequence[str]) -> dict[str, float]:
+        names = list(self.full_model.names)[1:]
+        for joint in locked:
+            if joint not in names:
+                raise InputError(f"{self.urdf}: locked joint '{joint}' is not a moving joint (moving: {', '.join(names)})")
+        for joint in mimics:
+            if joint in names and joint not in locked:
+                locked[joint] = 0.0
+                self.warnings.append(f"joint '{joint}' mimics another joint and was locked at 0")
+        return locked
+
+    def _reference(self) -> Array:
+        q = pin.neutral(self.full_model)
+        for joint, position in self.locked.items():
+            j = self.full_model.joints[self.full_model.getJointId(joint)]
+            q[j.idx_q : j.idx_q + j.nq] = [np.cos(position), np.sin(position)] if j.nq == 2 else [position] * j.nq
+        return np.asarray(q)
+
+    def _check_joint_types(self) -> None:
+        for name, joint in zip(self.joint_names, list(self.model.joints)[1:], strict=True):
+            if joint.nv != 1 or joint.nq > 2:
+                raise InputError(
+                    f"{self.urdf}: joint '{name}' has {joint.nv} degrees of freedom; only revolute, prismatic and "
+                    "continuous joints are supported (lock it, or split it)"
+                )
+
+    def _add_payload(self, payload: PayloadSpec) -> None:
+        frame = self.model.frames[self.frame_id(payload.frame)]
+        if payload.mass > 0.0:
+            inertia = pin.Inertia(payload.mass, np.asarray(payload.com, float), np.zeros((3, 3)))
+            self.model.appendBodyToJoint(frame.parentJoint, inertia, frame.placement)
+
+    def _index_joints(self) -> None:
+        joints = list(self.model.joints)[1:]
+        self.idx_q = np.array([j.idx_q for j in joints])
+        self.continuous = np.array([j.nq == 2 for j in joints])
+        # q̇ = (rate_const + rate_sign * q[rate_partner]) * v[rate_v]: 1 for scalar joints, (-sin, cos) for continuous
+        self.rate_const, self.rate_sign = np.ones(self.nq), np.zeros(self.nq)
+        self.rate_partner, self.rate_v = np.arange(self.nq), np.zeros(self.nq, dtype=int)
+        for i, j in enumerate(joints):
+            self.rate_v[j.idx_q : j.idx_q + j.nq] = i
+            if j.nq == 2:
+                c, s = j.idx_q, j.idx_q + 1
+                self.rate_const[[c, s]] = 0.0
+                self.rate_partner[[c, s]] = s, c
+                self.rate_sign[[c, s]] = -1.0, 1.0
+        lower, upper = np.asarray(self.model.lowerPositionLimit), np.asarray(self.model.upperPositionLimit)
+        self.q_lower = np.where(self.continuous, -np.inf, lower[self.idx_q])
+        self.q_upper = np.where(self.continuous, np.inf, upper[self.idx_q])
+        self.ancestors = np.zeros((self.model.njoints, self.nv))
+        for joint in range(1, self.model.njoints):
+            for support in list(self.model.supports[joint])[1:]:
+                self.ancestors[joint, self.model.joints[support].idx_v] = 1.0
+
+    def _limits(self, what: str, from_urdf: Array, override: PerJoint | None) -> Array:
+        limits = np.asarray(from_urdf, float).copy()
+        usable = np.isfinite(limits) & (limits > 0.0)
+        if override is not None:
+            limits = per_joint(override, self.joint_names, what, default=limits)
+            usable = np.isfinite(limits) & (limits > 0.0)
+        for i in np.flatnonzero(~usable):
+            name = self.joint_names[i]
+            unit = "10.0" if what == "effort" else "2.0"
+            raise InputError(
+                f"{self.urdf}: joint '{name}' has no usable {what} limit (got {limits[i]:g}); "
+                f"give one in a robot spec, e.g. `{what}: {{{name}: {unit}}}`, or lock the joint"
+            )
+        return limits
+
+    def frame_id(self, name: str) -> int:
+        """Pinocchio's id of a link or frame; InputError if there is none by that name."""
+        if not self.model.existFrame(name):
+            bodies = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
+            raise InputError(f"{self.urdf}: no link or frame is named '{name}' (links: {', '.join(bodies[:20])})")
+        return int(self.model.getFrameId(name))
+
+    def points(self, frames: Sequence[str], centers: Array) -> BodyPoints:
+        """Body points given in link or frame coordinates [m]."""
+        joints, offsets = [], []
+        for name, center in zip(frames, np.asarray(centers, float).reshape(-1, 3), strict=True):
+            frame = self.model.frames[self.frame_id(name)]
+            joints.append(frame.parentJoint)
+            offsets.append(frame.placement.act(center))
+        return BodyPoints(self, joints, np.asarray(offsets))
+
+    def evaluate(self, q: Array, v: Array) -> Dynamics:
+        """Kinematics and dynamics at one state; q (nq,), v (nv,)."""
+        model, data = self.model, self.data
+        pin.computeAllTerms(model, data, q, v)
+        Minv = pin.computeMinverse(model, data, q)
+        pin.computeJointJacobiansTimeVariation(model, data, q, v)
+        upper = np.triu(data.M)
+        g = data.g.copy()
+        dyn = Dynamics(
+            q=q.copy(),
+            v=v.copy(),
+            M=upper + np.triu(upper, 1).T,
+            Minv=np.triu(Minv) + np.triu(Minv, 1).T,
+            Cv=data.nle - g,
+            g=g,
+            placements=np.array([T.homogeneous for T in data.oMi]),
+            J=data.J.copy(),
+            dJ=data.dJ.copy(),
+        )
+        for array in vars(dyn).values():
+            array.flags.writeable = False
+        return dyn
+
+    def evaluate_batch(self, q: Array, v: Array) -> Dynamics:
+        """The same for a batch: q (B, nq), v (B, nv); every array gains a leading axis B."""
+        rows = [vars(self.evaluate(qi, vi)) for qi, vi in zip(q, v, strict=True)]
+        return Dynamics(**{k: np.stack([r[k] for r in rows]) for k in rows[0]})
+
+    def acceleration(self, q: Array, v: Array, u: Array) -> Array:
+        """Forward dynamics by the articulated-body algorithm, (nv,)."""
+        return np.asarray(pin.aba(self.model, self.data, q, v, u))
+
+    def gravity(self, q: Array) -> Array:
+        """g(q), (nv,) [N m | N]."""
+        return np.array(pin.computeGeneralizedGravity(self.model, self.data, q))
+
+    def potential_energy(self, q: Array) -> float:
+        """Gravitational potential [J]."""
+        return float(pin.computePotentialEnergy(self.model, self.data, q))
+
+    def integrate(self, q: Array, dq: Array) -> Array:
+        """q ⊕ dq on the configuration manifold."""
+        return np.asarray(pin.integrate(self.model, q, dq))
+
+    def difference(self, q0: Array, q1: Array) -> Array:
+        """q1 ⊖ q0, (nv,)."""
+        return np.asarray(pin.difference(self.model, q0, q1))
+
+    def from_angles(self, angles: Array) -> Array:
+        """Configuration (..., nq) from one number per moving joint (..., nv)."""
+        angles = np.asarray(angles, float)
+        q = np.zeros((*angles.shape[:-1], self.nq))
+        scalar = ~self.continuous
+        q[..., self.idx_q[scalar]] = angles[..., scalar]
+        q[..., self.idx_q[self.continuous]] = np.cos(angles[..., self.continuous])
+        q[..., self.idx_q[self.continuous] + 1] = np.sin(angles[..., self.continuous])
+        return q
+
+    def to_angles(self, q: Array) -> Array:
+        """One number per moving joint (..., nv); continuous joints in (-π, π]."""
+        angles = np.array(q[..., self.idx_q])
+        c = self.idx_q[self.continuous]
+        angles[..., self.continuous] = np.arctan2(q[..., c + 1], q[..., c])
+        return angles
+
+    def q_rate(self, q: Array, v: Array) -> Array:
+        """q̇ in Pinocchio's coordinates (..., nq): v for scalar joints, (-sin, cos) v for continuous ones."""
+        return np.asarray((self.rate_const + self.rate_sign * q[..., self.rate_partner]) * v[..., self.rate_v])
+
+    def parse_angles(self, values: Sequence[float], what: str) -> Array:
+        """Configuration from one finite number per moving joint, or an InputError."""
+        return self.from_angles(vector(values, self.nv, what))
+
+    def check_mass_matrix(self, angles: Array) -> None:
+        """Refuse a mass matrix that is not positive definite at any of ``angles`` (B, nv)."""
+        for q in self.from_angles(angles):
+            M = np.triu(pin.crba(self.model, self.data, q))
+            M = M + np.triu(M, 1).T
+            values, vectors = np.linalg.eigh(M) if np.all(np.isfinite(M)) else (np.array([np.nan]), np.ones((self.nv, 1)))
+            if not values[0] > PD_RELATIVE_FLOOR * max(values[-1], 1e-6):
+                joint = self.joint_names[int(np.argmax(np.abs(vectors[:, 0])))]
+                raise InputError(
+                    f"{self.urdf}: the mass matrix is not positive definite (least eigenvalue {values[0]:.3g}): the link "
+                    f"moved by joint '{joint}' has no mass or inertia; give it one in the URDF, or lock the joint"
+                )

@@ -1,0 +1,136 @@
+"""The runtime filter for any torque control loop: state and desired torque in, safe torque and status out."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status
+from ppcbf_robots.robot import Dynamics, RobotModel
+from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.specs import Array
+
+log = logging.getLogger(__name__)
+
+RESTING_SPEED = 5e-3  # of v_max, below which a corrected arm counts as resting
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one control step produced."""
+
+    u: Array  # (nv,) torque to command [N m | N]
+    status: Status
+    reason: str
+    h: float  # least over the rows [m | rad]
+    phi: float  # least over the rows
+    row: str  # name of the row that decided, "" if none
+
+
+class SafetyFilter:
+    """Corrects a desired torque as little as its metric allows so that every row of the barrier holds.
+
+    Args:
+        robot: the robot the barrier was made for.
+        safety: its safety function in this world.
+        barrier: one of the four barriers.
+        config: filter settings.
+        damping: K_d (nv,) of the fallback torque ``sat(g - K_d v)``; by default 1 % of u_max per v_max.
+        gravity_included: False if u_des leaves gravity out and the returned torque must too (libfranka).
+
+    The filter keeps counts of every status in ``counts`` and logs each step down its ladder with the reason. Python is
+    not a safety-rated function: keep the robot's own monitored limits on.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        safety: SafetyFunction,
+        barrier: Barrier,
+        config: FilterConfig | None = None,
+        damping: Array | None = None,
+        gravity_included: bool = True,
+    ) -> None:
+        self.robot, self.safety, self.barrier = robot, safety, barrier
+        self.config = config or FilterConfig()
+        self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else damping
+        self.gravity_included = gravity_included
+        self.correction = (ClosedForm if self.config.kind == "closed-form" else QPFilter)(barrier, self.config)
+        self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
+        self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
+
+    def step(
+        self, t: float, q: ArrayLike, v: ArrayLike, u_des: ArrayLike, d_p: float | None = None
+    ) -> StepResult:
+        """One control step.
+
+        Args:
+            t: time of the state [s]; must not go backwards.
+            q: configuration (nq,), continuous joints as (cos, sin).
+            v: joint velocity (nv,) [rad/s | m/s].
+            u_des: desired torque (nv,) [N m | N].
+            d_p: dissipation of the desired torque [W], the budget of the passivity row ``vᵀ(u - u_des) <= d_p``;
+                None leaves that row out (for controllers that are not passive).
+
+        Returns:
+            A finite torque, inside the box unless the filter is the closed form, and its status.
+        """
+        q, v, u_des = (np.asarray(x, dtype=float) for x in (q, v, u_des))
+        problem = self._invalid(t, q, v)
+        if problem:
+            return self._count(self._hold(t, problem))
+        return self._count(self.filter(t, self.robot.evaluate(q, v), u_des, d_p))
+
+    def filter(self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None) -> StepResult:
+        """The step for a state that was already evaluated (and checked)."""
+        u_max = self.robot.u_max
+        self._last = (t, dyn.g)
+        rows = self.barrier.rows(dyn, self.safety.evaluate(dyn))
+        offset = 0.0 if self.gravity_included else dyn.g
+        h, phi = float(rows.h.min()), float(rows.phi.min())
+        usable = u_des.shape == (self.robot.nv,) and bool(np.all(np.isfinite(u_des + offset)))
+        usable = usable and (d_p is None or np.isfinite(d_p)) and bool(np.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum()))
+        if not usable:
+            u = np.clip(dyn.g - self.damping * dyn.v, -u_max, u_max) - offset
+            return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")
+        c = self.correction.correct(dyn, rows, u_des + offset, d_p, u_max)
+        if c.status is Status.FAULT:
+            u = np.clip(dyn.g - self.damping * dyn.v, -u_max, u_max)
+            return StepResult(u - offset, c.status, c.reason, h, phi, self._name(c.row))
+        status = c.status
+        if status is Status.CORRECTING and c.row >= 0 and np.all(np.abs(dyn.v) <= RESTING_SPEED * self.robot.v_max):
+            status = Status.RESTING
+        return StepResult(c.u - offset, status, c.reason, h, phi, self._name(c.row))
+
+    def _name(self, row: int) -> str:
+        return self.safety.names[row] if row >= 0 else ""
+
+    def _invalid(self, t: float, q: Array, v: Array) -> str:
+        if q.shape != (self.robot.nq,) or v.shape != (self.robot.nv,):
+            return f"state of shape {q.shape}, {v.shape} instead of ({self.robot.nq},), ({self.robot.nv},)"
+        if not (np.isfinite(t) and np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+            return "state not finite"
+        c = self.robot.idx_q[self.robot.continuous]
+        if np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):
+            return "a continuous joint's (cos, sin) is not of length 1"
+        if self._last is not None and t < self._last[0]:
+            return f"time went backwards, from {self._last[0]:g} s to {t:g} s"
+        return ""
+
+    def _hold(self, t: float, problem: str) -> StepResult:
+        """Gravity torque of the last valid state for at most max_hold, then STOP with zero torque."""
+        if self._last is not None and 0.0 <= t - self._last[0] <= self.config.max_hold:
+            g = np.clip(self._last[1], -self.robot.u_max, self.robot.u_max)
+            u = g if self.gravity_included else np.zeros_like(g)
+            return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
+        return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
+
+    def _count(self, result: StepResult) -> StepResult:
+        self.counts[result.status] += 1
+        if result.status >= Status.PASSIVITY_DROPPED:
+            log.warning("%s: %s %s", result.status.name, result.reason, result.row)
+        return result

@@ -1,0 +1,269 @@
+"""What users write: robot specs and worlds in YAML, validated before anything is built.
+
+Lengths are metres, angles radians, masses kilograms, efforts newton-metres or newtons.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from ppcbf_robots.errors import InputError
+
+Array = NDArray[np.float64]
+Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+PerJoint = float | list[float] | dict[str, float]
+"""One number for all moving joints, a list in joint order, or a mapping by joint name."""
+
+
+class Spec(BaseModel):
+    """Common strictness: no unknown keys, no NaN, no infinity."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class ControllerSpec(Spec):
+    """Passive nominal controller (see :mod:`ppcbf_robots.controllers`)."""
+
+    type: Literal["pd_gravity", "shaping", "bounded_spring"] = "bounded_spring"
+    kp: PerJoint | None = None  # [N m/rad | N/m]
+    kd: PerJoint | None = None  # [N m s/rad | N s/m]
+    max_spring: PerJoint | None = None  # [N m | N], bounded_spring only
+
+
+class BodySphere(Spec):
+    """A sphere fixed to a link or frame; radius 0 is a point."""
+
+    frame: str
+    center: Vector3 = [0.0, 0.0, 0.0]
+    radius: NonNegative = 0.0
+
+
+class DomainSpec(Spec):
+    """The set X on which a barrier is trained, as one (low, high) pair per moving joint."""
+
+    q: list[tuple[float, float]] | None = None
+    v: list[tuple[float, float]] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> DomainSpec:
+        for name, bounds in (("q", self.q), ("v", self.v)):
+            for i, (low, high) in enumerate(bounds or []):
+                if not low < high:
+                    raise ValueError(f"{name}[{i}]: the lower bound {low} must be below the upper bound {high}")
+        for i, (low, high) in enumerate(self.v or []):
+            if not low < 0.0 < high:
+                raise ValueError(f"v[{i}]: the range ({low}, {high}) must contain 0, or the robot could never rest")
+        return self
+
+
+class PayloadSpec(Spec):
+    """A point mass carried rigidly by a frame."""
+
+    frame: str
+    mass: NonNegative
+    com: Vector3 = [0.0, 0.0, 0.0]
+
+
+class BarrierSpec(Spec):
+    """Constants of the barrier formulas (paper, §5); the defaults suit most arms."""
+
+    gamma: Positive = 5.0  # [1/s], of eq. (25)
+    alpha_pp: Positive = 100.0  # [J/m], the paper's alpha of the PP-CBF
+    gamma_K: Positive = 10.0  # [1/s], of the PP-CBF's zeroing condition
+    epsilon: Positive = 0.05  # [m/s], width of the band of eq. (21)
+    act_within: Positive | None = None  # [m]: closed form acts where h <= this instead of phi <= epsilon
+
+
+class RobotSpec(Spec):
+    """A robot: its URDF and everything the URDF does not say. Only ``urdf`` is required."""
+
+    urdf: str
+    package_dirs: list[str] = []
+    locked: dict[str, float] = {}
+    effort: PerJoint | None = None
+    velocity: PerJoint | None = None
+    controller: ControllerSpec | None = None
+    body: list[BodySphere] | None = None
+    domain: DomainSpec = DomainSpec()
+    start: list[float] | None = None
+    start_velocity: list[float] | None = None
+    goal: list[float] | None = None
+    payload: PayloadSpec | None = None
+    barrier: BarrierSpec = BarrierSpec()
+
+
+class Sphere(Spec):
+    """Solid ball."""
+
+    type: Literal["sphere"]
+    name: str
+    center: Vector3
+    radius: Positive
+    margin: NonNegative = 0.0
+
+
+class HalfSpace(Spec):
+    """Everything with ``normal . p < offset`` is solid; the free side is ``normal . p >= offset``."""
+
+    type: Literal["half_space"]
+    name: str
+    normal: Vector3
+    offset: float
+    margin: NonNegative = 0.0
+
+    @field_validator("normal")
+    @classmethod
+    def _unit(cls, value: list[float]) -> list[float]:
+        norm = math.sqrt(sum(x * x for x in value))
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(f"the normal must have length 1, got {norm:.6g}")
+        return [x / norm for x in value]
+
+
+Obstacle = Annotated[Sphere | HalfSpace, Field(discriminator="type")]
+
+
+class WorldSpec(Spec):
+    """The obstacles around the robot, in its base frame."""
+
+    obstacles: Annotated[list[Obstacle], Field(min_length=1)]
+
+    @field_validator("obstacles")
+    @classmethod
+    def _unique_names(cls, value: list[Sphere | HalfSpace]) -> list[Sphere | HalfSpace]:
+        names = [o.name for o in value]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two obstacles are named '{name}'; give each its own name")
+        return value
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2's idea of numbers and booleans, and no silent overwriting of repeated keys."""
+
+    yaml_implicit_resolvers = {
+        first: [(tag, rx) for tag, rx in resolvers if tag not in ("tag:yaml.org,2002:float", "tag:yaml.org,2002:bool")]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key_node, _ in node.value:
+            if key_node.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key '{key_node.value}' stands twice", key_node.start_mark
+                )
+            seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+_FLOAT = re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
+
+S = TypeVar("S", bound=Spec)
+MAX_SPEC_BYTES = 4_000_000
+
+
+def read_text(path: Path, what: str) -> str:
+    """Text of a file, or an :class:`InputError` that says why not."""
+    try:
+        if path.stat().st_size > MAX_SPEC_BYTES * 10:
+            raise InputError(f"{path}: larger than {MAX_SPEC_BYTES * 10 // 10**6} MB, which no {what} is")
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{what} not found: {path}") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a folder; give the path of a {what}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def load_spec(path: Path, kind: type[S], what: str) -> S:
+    """Read and validate a YAML file.
+
+    Raises:
+        InputError: one sentence naming the file, the line or the key, and what was expected.
+    """
+    text = read_text(path, what)
+    if len(text) > MAX_SPEC_BYTES:
+        raise InputError(f"{path}: larger than {MAX_SPEC_BYTES // 10**6} MB, which no {what} is")
+    try:
+        data = yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader with stricter resolvers
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "unknown line"
+        raise InputError(f"{path}: not valid YAML at {where}: {error.problem}") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a mapping with keys such as {', '.join(list(kind.model_fields)[:3])}")
+    return validate(data, kind, str(path))
+
+
+def validate(data: dict[str, Any], kind: type[S], where: str) -> S:
+    """Validated spec from plain data; raises InputError with the first problem in words."""
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{where}: {_first_problem(error, kind)}") from None
+
+
+def _first_problem(error: ValidationError, kind: type[Spec]) -> str:
+    problem = error.errors(include_url=False)[0]
+    loc = [str(x) for x in problem["loc"] if str(x) not in ("sphere", "half_space", "float", "list[float]", "dict[str,float]")]
+    key = ".".join(loc) or "file"
+    if problem["type"] == "extra_forbidden":
+        known = ", ".join(kind.model_fields) if len(loc) == 1 else "see the README's list of keys"
+        return f"unknown key '{key}' (known: {known})"
+    if problem["type"] == "missing":
+        return f"the key '{key}' is missing"
+    got = problem.get("input")
+    shown = "" if isinstance(got, dict) or got is None else f", got {got!r}"[:80]
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{key}: {message[0].lower()}{message[1:]}{shown if problem['type'] != 'value_error' else ''}"
+
+
+def per_joint(value: PerJoint, names: Sequence[str], what: str, default: Array | None = None) -> Array:
+    """(nv,) array from one number, a list in joint order, or a mapping by joint name.
+
+    Joints a mapping leaves out keep ``default``; without one they must all be named.
+    """
+    n = len(names)
+    if isinstance(value, dict):
+        unknown = [k for k in value if k not in names]
+        if unknown:
+            raise InputError(f"{what}: no moving joint is named '{unknown[0]}' (moving joints: {', '.join(names)})")
+        missing = [k for k in names if k not in value]
+        if missing and default is None:
+            raise InputError(f"{what}: no value for joint '{missing[0]}'")
+        base = np.zeros(n) if default is None else default.copy()
+        for k, x in value.items():
+            base[names.index(k)] = x
+        return base
+    if isinstance(value, list):
+        return vector(value, n, what)
+    return np.full(n, float(value))
+
+
+def vector(value: Sequence[float], n: int, what: str) -> Array:
+    """(n,) finite array, or an InputError that says what was expected and what came."""
+    array = np.asarray(value, dtype=float)
+    if array.shape != (n,):
+        raise InputError(f"{what}: expected {n} numbers, one per moving joint, got {array.size}")
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"{what}: every number must be finite, got {array.tolist()}")
+    return array
