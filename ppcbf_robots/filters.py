@@ -16,6 +16,7 @@ import numpy as np
 from ppcbf_robots.barriers import Barrier, BarrierRows
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics
+from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array
 
 Metric = Literal["torque", "kinetic"]
@@ -66,8 +67,8 @@ class Correction:
 class ClosedForm:
     """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
 
-    def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
-        self.barrier, self.config = barrier, config
+    def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
+        self.barrier, self.safety, self.config = barrier, safety, config
 
     def _active(self, rows: BarrierRows) -> Array:
         spec = self.barrier.spec
@@ -83,29 +84,46 @@ class ClosedForm:
         if not active.size:
             return Correction(u_des, Status.FREE, "outside the band", -1)
         k = int(active[np.argmin(rows.phi[active])])
-        Lg = rows.Lg_phi[k]
-        residual = float(rows.Lf_phi[k] + Lg @ u_des)  # psi(x, u_des)
         if self.barrier.kind == "pp-cbf":
-            residual += self.barrier.spec.gamma_K * float(rows.phi[k])
-        if residual >= 0.0:
+            return self._damp(dyn, k, u_des)
+        Lg = rows.Lg_phi[k]
+        psi = float(rows.Lf_phi[k] + Lg @ u_des)
+        if psi >= 0.0:
             return Correction(u_des, Status.FREE, "psi(u_des) >= 0", -1)
         direction = Lg if self.config.metric == "torque" else rows.w[k]
         gain = float(Lg @ direction)
-        multiplier = -residual / max(gain, _TINY)
-        if self.barrier.kind == "pp-cbf":
-            multiplier = min(multiplier, self._stopping_gain(dyn))
-        elif gain < _TINY:
+        if gain < _TINY:
             return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
-        return Correction(u_des + multiplier * direction, Status.CORRECTING, "psi(u_des) < 0", k)
+        return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
 
-    def _stopping_gain(self, dyn: Dynamics) -> float:
-        """The largest gain of the damper -multiplier v (or -multiplier M v) that does not reverse v within one period.
+    def _damp(self, dyn: Dynamics, k: int, u_des: Array) -> Correction:
+        """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one control period.
 
-        The PP-CBF's L_g phi = -vᵀ vanishes at rest, where the formula divides by |v|² and chatters.
+        L_g phi = -vᵀ vanishes at rest, where the explicit λ divides by |v|² and chatters (30 N m from tick to tick on
+        the 2R). Here λ is the least one for which the condition holds at the velocity v⁺ the period ends with,
+        ``(M + dt λ D) v⁺ = M v + dt (u_des - b)``: the paper's λ as dt -> 0, and a smooth stop at rest.
         """
-        if self.config.metric == "kinetic":
-            return 1.0 / self.config.dt
-        return 1.0 / (self.config.dt * float(np.linalg.eigvalsh(dyn.Minv)[-1]))
+        dt, spec = self.config.dt, self.barrier.spec
+        momentum = dyn.M @ dyn.v + dt * (u_des - dyn.b)
+        D = np.eye(len(u_des)) if self.config.metric == "torque" else dyn.M
+        safety = self.safety.evaluate(dyn)
+        grad, h = safety.grad[k], float(safety.h[k])
+
+        def damped(multiplier: float) -> tuple[float, Array]:
+            """Residual of ``phi̇ >= -gamma_K phi`` and the correction, both at v⁺."""
+            v = np.linalg.solve(dyn.M + dt * multiplier * D, momentum)
+            correction = -multiplier * (D @ v)
+            phi_dot = spec.alpha_pp * (grad @ v) - v @ (u_des + correction - dyn.g)
+            phi = spec.alpha_pp * h - 0.5 * v @ dyn.M @ v
+            return float(phi_dot + spec.gamma_K * phi), correction
+
+        if damped(0.0)[0] >= 0.0:
+            return Correction(u_des, Status.FREE, "psi(u_des) >= -gamma_K phi", -1)
+        low, high = 1e-3, 1e12  # relative to the inertia, from hardly any damper to a dead stop
+        for _ in range(40):
+            middle = float(np.sqrt(low * high))
+            low, high = (low, middle) if damped(middle)[0] >= 0.0 else (middle, high)
+        return Correction(u_des + damped(high)[1], Status.CORRECTING, "psi(u_des) < -gamma_K phi", k)
 
 
 class QPFilter:
@@ -116,8 +134,8 @@ class QPFilter:
     afterwards and join if they are violated, so the answer satisfies all rows.
     """
 
-    def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
-        self.barrier, self.config = barrier, config
+    def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
+        self.barrier, self.safety, self.config = barrier, safety, config
         self.solver: QPSolver = make_solver(config.solver)
         self._last_rows: Array | None = None
 

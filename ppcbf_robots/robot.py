@@ -217,6 +217,8 @@ class RobotModel:
         if not self.model.existFrame(name):
             bodies = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
             raise InputError(f"{self.urdf}: no link or frame is named '{name}' (links: {', '.join(bodies[:20])})")
+        if self.model.existFrame(name, pin.FrameType.BODY):  # a joint may bear the same name
+            return int(self.model.getFrameId(name, pin.FrameType.BODY))
         return int(self.model.getFrameId(name))
 
     def points(self, frames: Sequence[str], centers: Array) -> BodyPoints:
@@ -300,6 +302,15 @@ class RobotModel:
     def parse_angles(self, values: Sequence[float], what: str) -> Array:
         """Configuration from one finite number per moving joint, or an InputError."""
         return self.from_angles(vector(values, self.nv, what))
+
+    def geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
+        """Visual or collision geometry of the reduced model; ValueError if meshes are missing."""
+        dirs = [str(d) for d in self.package_dirs]
+        full = pin.buildGeomFromUrdf(self.full_model, str(self.urdf), kind, package_dirs=dirs)
+        if not self.locked:
+            return full
+        ids = [self.full_model.getJointId(n) for n in self.locked]
+        return pin.buildReducedModel(self.full_model, [full], ids, self.reference)[1][0]
 
     def check_mass_matrix(self, angles: Array) -> None:
         """Refuse a mass matrix that is not positive definite at any of ``angles`` (B, nv)."""

@@ -59,8 +59,9 @@ class SafetyFilter:
         self.config = config or FilterConfig()
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else damping
         self.gravity_included = gravity_included
-        self.correction = (ClosedForm if self.config.kind == "closed-form" else QPFilter)(barrier, self.config)
+        self.correction = (ClosedForm if self.config.kind == "closed-form" else QPFilter)(barrier, safety, self.config)
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
+        self._last_status = Status.FREE
         self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
 
     def step(
@@ -131,6 +132,8 @@ class SafetyFilter:
 
     def _count(self, result: StepResult) -> StepResult:
         self.counts[result.status] += 1
-        if result.status >= Status.PASSIVITY_DROPPED:
-            log.warning("%s: %s %s", result.status.name, result.reason, result.row)
+        if result.status is not self._last_status:  # a change, not every tick of a lasting alarm
+            level = logging.WARNING if result.status >= Status.PASSIVITY_DROPPED else logging.DEBUG
+            log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)
+            self._last_status = result.status
         return result

@@ -1,0 +1,167 @@
+"""One robot in one world with its controller: everything a barrier, a filter or a rollout is about."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ppcbf_robots.barriers import Barrier, BarrierKind, EnergyBarrier, RhoBarrier
+from ppcbf_robots.controllers import NominalController
+from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_body, derive_domain, derive_gains
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.network import NumpyNetwork
+from ppcbf_robots.resources import default_package_dirs, find_robot, find_world
+from ppcbf_robots.robot import RobotModel
+from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, WorldSpec, load_spec, vector
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot as specified and derived, before any world."""
+
+    name: str  # as the user wrote it
+    model: RobotModel
+    spec: RobotSpec
+    body: list[BodySphere]
+    domain: Domain
+    controller: NominalController
+    start: Array  # (nq,)
+    start_velocity: Array  # (nv,)
+    derived: list[str]  # what was not in the spec and was derived
+
+    @property
+    def goal(self) -> Array:
+        """Goal configuration (nq,)."""
+        return self.controller.goal
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A robot, a world and the safety function of the two."""
+
+    robot: Robot
+    world_name: str
+    world: WorldSpec
+    safety: SafetyFunction
+
+    @property
+    def model(self) -> RobotModel:
+        """The robot's model."""
+        return self.robot.model
+
+    def barrier(self, kind: BarrierKind, network: NumpyNetwork | None = None, spec: BarrierSpec | None = None) -> Barrier:
+        """A barrier of one of the four kinds with the robot's constants, or with those of ``spec``."""
+        spec = spec or self.robot.spec.barrier
+        return EnergyBarrier(spec) if kind == "pp-cbf" else RhoBarrier(kind, self.model, spec, network)
+
+    def with_goal(self, goal: Array) -> Problem:
+        """The same problem towards another goal (nq,)."""
+        robot = dataclasses.replace(self.robot, controller=self.robot.controller.with_goal(goal))
+        return dataclasses.replace(self, robot=robot)
+
+    def with_barrier_spec(self, spec: BarrierSpec) -> Problem:
+        """The same problem with other barrier constants."""
+        robot = dataclasses.replace(self.robot, spec=self.robot.spec.model_copy(update={"barrier": spec}))
+        return dataclasses.replace(self, robot=robot)
+
+    def check_start(self, q: Array) -> None:
+        """Refuse a start configuration inside an obstacle or beyond a joint limit."""
+        h, row = self.safety.least(q)
+        if h < 0.0:
+            raise InputError(
+                f"the start configuration violates '{row}' by {-h:.4f}: give another with --start, or `start` in the spec"
+            )
+
+    def fingerprint(self) -> dict[str, str]:
+        """SHA-256 of what a barrier depends on: URDF, robot parameters, world."""
+        m = self.model
+        robot = {
+            "joints": m.joint_names,
+            "locked": m.locked,
+            "u_max": m.u_max.tolist(),
+            "v_max": m.v_max.tolist(),
+            "payload": None if self.robot.spec.payload is None else self.robot.spec.payload.model_dump(),
+            "body": [s.model_dump() for s in self.robot.body],
+        }
+        world = [o.model_dump() for o in self.world.obstacles]
+        digest = {k: hashlib.sha256(json.dumps(x, sort_keys=True).encode()).hexdigest()
+                  for k, x in (("robot", robot), ("world", world))}
+        return {"urdf": m.urdf_sha256, **digest}
+
+
+def load_robot(name: str) -> Robot:
+    """A robot from a bundled name, a YAML spec, a URDF path or a name in example-robot-data.
+
+    Raises:
+        InputError: for anything the method cannot use, with the remedy.
+    """
+    path = find_robot(name)
+    if path.suffix in (".yaml", ".yml"):
+        spec = load_spec(path, RobotSpec, "robot spec")
+        urdf = _spec_urdf(path, spec)
+    else:
+        spec, urdf = RobotSpec(urdf=str(path)), path
+    dirs = [(path.parent / d).resolve() for d in spec.package_dirs] + default_package_dirs(urdf)
+    model = RobotModel(urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload)
+    domain = derive_domain(model, spec.domain)
+    model.check_mass_matrix(domain.sample_q(np.random.default_rng(SAMPLE_SEED), 100))
+    derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]
+    derived += [f"domain.{k}" for k in ("q", "v") if getattr(spec.domain, k) is None]
+    body = spec.body if spec.body is not None else derive_body(model)
+    start = _default_start(model, domain) if spec.start is None else vector(spec.start, model.nv, f"{path}: start")
+    goal = _default_goal(start, domain) if spec.goal is None else vector(spec.goal, model.nv, f"{path}: goal")
+    velocity = spec.start_velocity or [0.0] * model.nv
+    gains = derive_gains(model, spec.controller, domain)
+    controller = NominalController(model, gains, model.from_angles(goal))
+    start_velocity = vector(velocity, model.nv, f"{path}: start_velocity")
+    return Robot(name, model, spec, body, domain, controller, model.from_angles(start), start_velocity, derived)
+
+
+def load_problem(robot: str, world: str) -> Problem:
+    """A robot and a world by name or path; InputError where they do not fit."""
+    loaded = load_robot(robot)
+    path = find_world(world)
+    spec = load_spec(path, WorldSpec, "obstacle spec")
+    return Problem(loaded, world, spec, SafetyFunction(loaded.model, loaded.body, spec.obstacles))
+
+
+def _spec_urdf(path: Path, spec: RobotSpec) -> Path:
+    """The URDF of a spec: relative to the spec's folder, else a name known to :func:`find_robot`."""
+    local = path.parent / spec.urdf
+    if local.is_file():
+        return local
+    found = find_robot(spec.urdf)
+    if found.suffix in (".yaml", ".yml"):
+        raise InputError(f"{path}: urdf must name a URDF, not the robot spec '{spec.urdf}'")
+    return found
+
+
+def _default_start(model: RobotModel, domain: Domain) -> Array:
+    """Zero where X allows it, else the middle of X."""
+    zero = np.zeros(model.nv)
+    inside = (domain.q[:, 0] < zero) & (zero < domain.q[:, 1])
+    return np.where(inside, zero, domain.q.mean(axis=1))
+
+
+def _default_goal(start: Array, domain: Domain) -> Array:
+    """The start moved by at most 0.8 rad towards the farther bound of X, joint by joint."""
+    room_up, room_down = domain.q[:, 1] - start, start - domain.q[:, 0]
+    step = np.minimum(0.8, 0.5 * np.maximum(room_up, room_down))
+    return np.asarray(start + np.where(room_up >= room_down, step, -step))
+
+
+def parse_vector(text: str | None, what: str) -> Sequence[float] | None:
+    """Numbers of a comma separated option, or None if it was not given."""
+    if text is None:
+        return None
+    try:
+        return [float(x) for x in text.replace(" ", "").split(",") if x]
+    except ValueError:
+        raise InputError(f"{what}: expected numbers separated by commas, got '{text}'") from None
