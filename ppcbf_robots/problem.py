@@ -16,7 +16,7 @@ from ppcbf_robots.controllers import NominalController
 from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_body, derive_domain, derive_gains
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.network import NumpyNetwork
-from ppcbf_robots.resources import default_package_dirs, find_robot, find_world
+from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, WorldSpec, load_spec, vector
@@ -133,13 +133,10 @@ def load_problem(robot: str, world: str) -> Problem:
 
 
 def _spec_urdf(path: Path, spec: RobotSpec) -> Path:
-    """The URDF of a spec: relative to the spec's folder, else a name known to :func:`find_robot`."""
-    local = path.parent / spec.urdf
-    if local.is_file():
-        return local
-    found = find_robot(spec.urdf)
-    if found.suffix in (".yaml", ".yml"):
-        raise InputError(f"{path}: urdf must name a URDF, not the robot spec '{spec.urdf}'")
+    """The URDF of a spec: relative to the spec's folder, else a name in example-robot-data."""
+    found = path.parent / spec.urdf if (path.parent / spec.urdf).is_file() else find_example(spec.urdf)
+    if found is None:
+        raise InputError(f"{path}: urdf: neither the file {path.parent / spec.urdf} nor a URDF of example-robot-data")
     return found
 
 

@@ -29,14 +29,19 @@ def find_robot(name: str) -> Path:
     specs = bundled("robots")
     if name in specs:
         return specs[name]
-    example = _example_urdfs()
-    for candidate in (name, f"{name}_robot"):
-        if candidate in example:
-            return example[candidate]
+    example = find_example(name)
+    if example is not None:
+        return example
     raise InputError(
         f"no robot named '{name}': give a URDF or YAML path, a bundled name ({', '.join(specs)}), "
         "or the name of a URDF in example-robot-data, such as ur5, z1 or xarm7"
     )
+
+
+def find_example(name: str) -> Path | None:
+    """The URDF of a robot in example-robot-data, by file name (``ur5`` finds ``ur5_robot.urdf``), or None."""
+    example = _example_urdfs()
+    return example.get(name) or example.get(f"{name}_robot")
 
 
 def find_world(name: str) -> Path:
