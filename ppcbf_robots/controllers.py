@@ -54,9 +54,9 @@ class NominalController:
         """The same controller towards another configuration (nq,)."""
         return NominalController(self.robot, self.gains, goal)
 
-    def spring(self, q: Array) -> tuple[Array, Array]:
-        """Restoring force (..., nv) and its potential (...) [J]."""
-        e = self.robot.to_angles(q) - self._goal_angles
+    def spring(self, q: Array, goal_angles: Array | None = None) -> tuple[Array, Array]:
+        """Restoring force (..., nv) and its potential (...) [J], towards the goal or other ``goal_angles`` (..., nv)."""
+        e = self.robot.to_angles(q) - (self._goal_angles if goal_angles is None else goal_angles)
         kp, f_max = self.gains.kp, self.gains.max_spring
         if self.gains.kind == "bounded_spring":
             root = np.sqrt(1.0 + (kp * e / f_max) ** 2)
@@ -69,9 +69,9 @@ class NominalController:
         potential = np.where(turning, k_turn * (1.0 - np.cos(e)), potential)
         return force, potential.sum(-1)
 
-    def u_rest(self, q: Array, g: Array) -> Array:
+    def u_rest(self, q: Array, g: Array, goal_angles: Array | None = None) -> Array:
         """u_des at v = 0, (..., nv), from q and the gravity torque g there."""
-        force, _ = self.spring(q)
+        force, _ = self.spring(q, goal_angles)
         return np.asarray(-force if self.gains.kind == "shaping" else g - force)
 
     def evaluate(self, dyn: Dynamics) -> Nominal:

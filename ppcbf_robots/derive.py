@@ -150,7 +150,7 @@ def _collision_vertices(robot: RobotModel) -> dict[int, Array]:
 
 def _shape_vertices(shape: pin.GeometryObject) -> Array | None:
     if hasattr(shape.geometry, "vertices") and callable(shape.geometry.vertices):
-        return np.asarray(shape.geometry.vertices()) * np.asarray(shape.meshScale)
+        return np.asarray(shape.geometry.vertices())  # already scaled by meshScale
     shape.geometry.computeLocalAABB()
     box = shape.geometry.aabb_local
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])

@@ -22,7 +22,11 @@ from ppcbf_robots.specs import Array
 Metric = Literal["torque", "kinetic"]
 FilterKind = Literal["closed-form", "qp"]
 
+Row = tuple[Array, float]  # (n,) of length 1 and its lower bound
+Box = tuple[Array, Array]  # (n,) bounds of the dimensionless correction
+
 _TINY = 1e-12
+_FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
@@ -47,7 +51,7 @@ class FilterConfig:
     kind: FilterKind = "qp"
     metric: Metric = "kinetic"
     solver: str = "proxqp"
-    alpha: float = 10.0  # [1/s], class-K gain of the QP's rows: psi >= -alpha (phi - margin)
+    alpha: float = 50.0  # [1/s], class-K gain of the QP's rows: psi >= -alpha (phi - margin)
     margin: float = 1e-3  # [m/s], phi kept above by the QP, for the control period's discretisation
     near_rows: int = 10  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
@@ -137,7 +141,6 @@ class QPFilter:
     def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
         self.barrier, self.safety, self.config = barrier, safety, config
         self.solver: QPSolver = make_solver(config.solver)
-        self._last_rows: Array | None = None
 
     def _slack(self, rows: BarrierRows, u_des: Array) -> Array:
         """Left side of every row at δ = 0; the row holds there if it is >= 0."""
@@ -153,24 +156,30 @@ class QPFilter:
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
         C = rows.Lg_phi * u_max
         norms = np.sqrt((C * C).sum(-1))
-        usable = norms > 1e-9
-        scale = np.maximum(norms, 1e-9)
+        scale = np.maximum(norms, _FLAT)
         C, lower = C / scale[:, None], -slack / scale
-        if np.any(~usable & (slack < -1e-9)):
-            k = int(np.argmin(np.where(usable, np.inf, slack)))
-            z = self._least_violation(dyn, C[usable], lower[usable], u_des, u_max)
-            return self._answer(z, u_des, u_max, Status.INFEASIBLE, "L_g phi is zero on a violated row", k)
+        box = (-1.0 - u_des / u_max, 1.0 - u_des / u_max)
+        ends = C * box[0], C * box[1]
+        binding = lower > np.minimum(*ends).sum(-1)  # the others hold for every torque in the box
+        hopeless = lower > np.maximum(*ends).sum(-1) + ROW_TOLERANCE  # no torque in the box satisfies them
+        if np.any(hopeless):
+            k = int(np.argmax(np.where(hopeless, lower, -np.inf)))
+            flat = norms[k] < _FLAT
+            reason = "L_g phi is zero on a violated row" if flat else "a row is out of reach of the torque box"
+            steerable = binding & (norms >= _FLAT)
+            z = self._least_violation(dyn, C[steerable], lower[steerable], box, u_max)
+            return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, k)
         passivity = self._passivity_row(dyn, d_p, u_max)
-        for row, status, reason in (
-            (passivity, Status.CORRECTING, "constraint active"),
-            (None, Status.PASSIVITY_DROPPED, "rows and box allow no passive torque"),
-        ):
-            if row is None and passivity is None and status is Status.PASSIVITY_DROPPED:
-                continue
-            z = self._solve(dyn, C, lower, usable, row, u_des, u_max)
-            if z is not None:
-                return self._answer(z, u_des, u_max, status, reason, self._tightest(C, lower, z))
-        z = self._least_violation(dyn, C[usable], lower[usable], u_des, u_max)
+        z = self._solve(dyn, C, lower, binding, passivity, box, u_max)
+        if z is not None:
+            k = self._tightest(C, lower, z)
+            return self._answer(z, u_des, u_max, Status.CORRECTING, "constraint active", k)
+        if passivity is not None:
+            z = self._solve(dyn, C, lower, binding, None, box, u_max)
+        if z is not None:
+            k = self._tightest(C, lower, z)
+            return self._answer(z, u_des, u_max, Status.PASSIVITY_DROPPED, "rows and box allow no passive torque", k)
+        z = self._least_violation(dyn, C[binding], lower[binding], box, u_max)
         k = int(np.argmax(lower))
         return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
 
@@ -181,7 +190,7 @@ class QPFilter:
         return k if residual[k] < 1e-4 else -1
 
     @staticmethod
-    def _passivity_row(dyn: Dynamics, d_p: float | None, u_max: Array) -> tuple[Array, float] | None:
+    def _passivity_row(dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p as (row, lower) of length 1; None where it constrains nothing."""
         if d_p is None:
             return None
@@ -196,38 +205,31 @@ class QPFilter:
         return np.asarray(H * (n / np.trace(H)))
 
     def _solve(
-        self,
-        dyn: Dynamics,
-        C: Array,
-        lower: Array,
-        usable: Array,
-        passivity: tuple[Array, float] | None,
-        u_des: Array,
-        u_max: Array,
+        self, dyn: Dynamics, C: Array, lower: Array, binding: Array, passivity: Row | None, box: Box, u_max: Array
     ) -> Array | None:
+        """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
         H = self._hessian(dyn, u_max)
-        box = (-1.0 - u_des / u_max, 1.0 - u_des / u_max)
-        ranked = np.argsort(np.where(usable, -lower, np.inf), kind="stable")
-        chosen = np.sort(ranked[: min(self.config.near_rows, int(usable.sum()))])
+        ranked = np.argsort(np.where(binding, -lower, np.inf), kind="stable")
+        chosen = np.sort(ranked[: max(1, min(self.config.near_rows, int(binding.sum())))])
+        slack_of = ROW_TOLERANCE * np.maximum(1.0, np.abs(lower))
         for _ in range(4):
-            rows, bounds = C[chosen], lower[chosen]
+            rows, bounds, allowed = C[chosen], lower[chosen], slack_of[chosen]
             if passivity is not None:
                 rows, bounds = np.vstack([rows, passivity[0]]), np.append(bounds, passivity[1])
-            same = self._last_rows is not None and np.array_equal(chosen, self._last_rows)
-            self._last_rows = chosen
-            z = self.solver.solve(QPProblem(H, np.zeros(len(H)), rows, bounds, *box, same_rows=same))
-            if z is None or not np.all(np.isfinite(z)):
+                allowed = np.append(allowed, ROW_TOLERANCE)
+            z = self._ask(QPProblem(H, np.zeros(len(H)), rows, bounds, *box))
+            if z is None:
                 return None
             z = np.clip(z, *box)
-            if np.any(rows @ z < bounds - ROW_TOLERANCE * np.maximum(1.0, np.abs(bounds))):
+            if np.any(rows @ z < bounds - allowed):
                 return None
-            missed = np.flatnonzero(usable & (C @ z < lower - ROW_TOLERANCE * np.maximum(1.0, np.abs(lower))))
+            missed = np.flatnonzero(binding & (C @ z < lower - slack_of))
             if not missed.size:
                 return z
-            chosen = np.union1d(chosen, missed[np.argsort((C @ z - lower)[missed])][: self.config.near_rows])
+            chosen = np.union1d(chosen, missed)
         return None
 
-    def _least_violation(self, dyn: Dynamics, C: Array, lower: Array, u_des: Array, u_max: Array) -> Array | None:
+    def _least_violation(self, dyn: Dynamics, C: Array, lower: Array, box: Box, u_max: Array) -> Array | None:
         """Torque in the box with the least worst violation: one slack shared by all rows, heavily weighted."""
         n = len(u_max)
         near = np.sort(np.argsort(-lower, kind="stable")[: self.config.near_rows])
@@ -235,10 +237,14 @@ class QPFilter:
         H[:n, :n] = self._hessian(dyn, u_max)
         H[n, n] = LEAST_VIOLATION_WEIGHT
         rows = np.hstack([C[near], np.ones((len(near), 1))])
-        box_low = np.append(-1.0 - u_des / u_max, 0.0)
-        box_high = np.append(1.0 - u_des / u_max, 1e6)
-        z = self.solver.solve(QPProblem(H, np.zeros(n + 1), rows, lower[near], box_low, box_high))
-        return None if z is None or not np.all(np.isfinite(z)) else np.clip(z[:n], box_low[:n], box_high[:n])
+        low, high = np.append(box[0], 0.0), np.append(box[1], 1e6)
+        z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[near], low, high))
+        return None if z is None else np.clip(z[:n], *box)
+
+    def _ask(self, problem: QPProblem) -> Array | None:
+        """The solver's answer if it is one: of the right length and finite."""
+        z = self.solver.solve(problem)
+        return z if z is not None and np.shape(z) == problem.g.shape and np.all(np.isfinite(z)) else None
 
     @staticmethod
     def _answer(z: Array | None, u_des: Array, u_max: Array, status: Status, reason: str, row: int) -> Correction:

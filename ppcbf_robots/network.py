@@ -14,7 +14,7 @@ Two forms:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -24,9 +24,10 @@ Params = Mapping[str, Any]
 
 
 def _elu(xp: Any, x: Any) -> tuple[Any, Any]:
-    """ELU and its derivative; exp only of the negative part, so that nothing overflows."""
-    e = xp.exp(xp.where(x > 0, xp.zeros_like(x), x))
-    return xp.where(x > 0, x, e - 1.0), e
+    """ELU and its derivative, as ``max(x, 0) + exp(min(x, 0)) - 1`` and ``exp(min(x, 0))``: nothing overflows."""
+    low = 0.5 * (x - xp.abs(x))
+    slope = xp.exp(low)
+    return x - low + slope - 1.0, slope
 
 
 def _hidden(xp: Any, p: Params, x: Any) -> tuple[Any, list[Any]]:
@@ -60,9 +61,7 @@ def _mlp(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
 
     def f(v: Any) -> tuple[Any, Any]:
         x, slopes = _hidden(xp, p, (xp.concatenate([q, v], -1) - p["in_shift"]) * scale)
-        out = x @ p["w_out"]
-        g = xp.zeros_like(x) + p["w_out"]
-        return out, _pull_back(p, g, slopes) * scale
+        return x @ p["w_out"], _pull_back(p, xp.zeros_like(x) + p["w_out"], slopes) * scale
 
     y, dy = f(v)
     y0, dy0 = f(xp.zeros_like(v))
@@ -90,6 +89,30 @@ def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
     db = (dz[..., None] * s[..., None, :]).reshape(*x.shape[:-1], -1)
     g = (D * _sigmoid(xp, ra)) @ p["Wa"].T + dc @ p["Wc"].T + db @ p["Wb"].T
     return K, _pull_back(p, g, slopes) * p["in_scale"], dK_dv
+
+
+def _mlp_out(xp: Any, p: Params, q: Any, v: Any) -> Any:
+    return _hidden(xp, p, (xp.concatenate([q, v], -1) - p["in_shift"]) * p["in_scale"])[0] @ p["w_out"]
+
+
+def _convex_units(xp: Any, p: Params, q: Any) -> tuple[Any, Any, Any]:
+    """a (..., units), c (..., units) and b (..., units, nv) of the convex form."""
+    x = _hidden(xp, p, (q - p["in_shift"]) * p["in_scale"])[0]
+    nv = p["v_scale"].shape[-1]
+    b = (x @ p["Wb"] + p["bb"]).reshape(*x.shape[:-1], p["ba"].shape[-1], nv)
+    return _softplus(xp, x @ p["Wa"] + p["ba"]), x @ p["Wc"] + p["bc"], b
+
+
+def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> Callable[[Any], Any]:
+    """The function ``s -> K(q, s d)`` for many s (...), with everything that depends on q alone done once."""
+    p = params
+    if kind == "mlp":
+        y0 = p["zero_at_rest"] * _mlp_out(xp, p, q, xp.zeros_like(d)) - (1.0 - p["zero_at_rest"]) * p["b_out"]
+        return lambda s: (_mlp_out(xp, p, q, s[..., None] * d) - y0) ** 2
+    a, c, b = _convex_units(xp, p, q)
+    slope = (b * (d * p["v_scale"])[..., None, :]).sum(-1)
+    rest, tangent = _softplus(xp, c), _sigmoid(xp, c) * slope
+    return lambda s: (a * (_softplus(xp, s[..., None] * slope + c) - rest - s[..., None] * tangent)).sum(-1)
 
 
 _FORMS = {"mlp": _mlp, "convex": _convex}

@@ -26,7 +26,6 @@ class QPProblem(NamedTuple):
     lower: Array  # (m,)
     box_low: Array  # (n,)
     box_high: Array  # (n,)
-    same_rows: bool = False  # whether the rows are those of the last problem, so that its solution is a good start
 
 
 class QPSolver(Protocol):
@@ -40,11 +39,11 @@ class QPSolver(Protocol):
 class ProxQPSolver:
     """ProxQP, dense, updated in place; one workspace per problem size.
 
-    Warm starts from the last solution are used only while the rows stay the same: across a change of rows they can
-    report a feasible problem as infeasible.
+    Every problem starts cold: a start from the last solution saves at most a fifth of the time and, where the problem
+    changed, ends "solved" up to 2 % of u_max away from the optimum, or reports a feasible problem as infeasible.
     """
 
-    def __init__(self, eps: float = 1e-8, max_iter: int = 300) -> None:
+    def __init__(self, eps: float = 1e-8, max_iter: int = 50) -> None:
         self.eps, self.max_iter = eps, max_iter
         self._workspaces: dict[tuple[int, int], Any] = {}
 
@@ -63,18 +62,17 @@ class ProxQPSolver:
             problem.box_low,
             problem.box_high,
         )
-        guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS
         if qp is None:
             qp = proxqp.dense.QP(n, 0, m, True, proxqp.dense.HessianType.Dense)
             qp.settings.eps_abs, qp.settings.eps_rel = self.eps, 0.0
-            qp.settings.max_iter, qp.settings.compute_timings = self.max_iter, False
-            qp.settings.initial_guess = guess
+            qp.settings.check_duality_gap = True  # or it stops with active rows 1e-3 loose, up to 2 % of u_max off
+            qp.settings.eps_duality_gap_abs, qp.settings.eps_duality_gap_rel = self.eps, 0.0
+            qp.settings.max_iter = qp.settings.max_iter_in = self.max_iter  # infeasible problems use them up
+            qp.settings.initial_guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS
+            qp.settings.compute_timings = False
             qp.init(*arguments)
             self._workspaces[(n, m)] = qp
         else:
-            if problem.same_rows and qp.results.info.status == proxqp.QPSolverOutput.PROXQP_SOLVED:
-                guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
-            qp.settings.initial_guess = guess
             qp.update(*arguments)
         qp.solve()
         if qp.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:

@@ -139,6 +139,7 @@ class RobotModel:
             self._add_payload(payload)
         self.data = self.model.createData()
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
+        self._below = np.tril_indices(self.nv, -1)
         self._index_joints()
         self.u_max = self._limits("effort", self.model.upperEffortLimit, effort)
         self.v_max = self._limits("velocity", self.model.upperVelocityLimit, velocity)
@@ -234,20 +235,21 @@ class RobotModel:
         """Kinematics and dynamics at one state; q (nq,), v (nv,)."""
         model, data = self.model, self.data
         pin.computeAllTerms(model, data, q, v)
-        Minv = pin.computeMinverse(model, data, q)
+        Minv = np.array(pin.computeMinverse(model, data, q))
         pin.computeJointJacobiansTimeVariation(model, data, q, v)
-        upper = np.triu(data.M)
-        g = data.g.copy()
+        M, g = data.M.copy(), data.g.copy()
+        below = self._below
+        M[below], Minv[below] = M.T[below], Minv.T[below]  # Pinocchio fills the upper triangles
         dyn = Dynamics(
             q=q.copy(),
             v=v.copy(),
-            M=upper + np.triu(upper, 1).T,
-            Minv=np.triu(Minv) + np.triu(Minv, 1).T,
+            M=M,
+            Minv=Minv,
             Cv=data.nle - g,
             g=g,
             placements=np.array([T.homogeneous for T in data.oMi]),
-            J=data.J.copy(),
-            dJ=data.dJ.copy(),
+            J=data.J.reshape(6, -1).copy(),  # a single joint's comes flat
+            dJ=data.dJ.reshape(6, -1).copy(),
         )
         for array in vars(dyn).values():
             array.flags.writeable = False

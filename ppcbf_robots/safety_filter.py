@@ -17,6 +17,7 @@ from ppcbf_robots.specs import Array
 log = logging.getLogger(__name__)
 
 RESTING_SPEED = 5e-3  # of v_max, below which a corrected arm counts as resting
+RESTING_TIME = 0.02  # [s]
 
 
 @dataclass(frozen=True)
@@ -103,9 +104,14 @@ class SafetyFilter:
             u = np.clip(dyn.g - self.damping * dyn.v, -u_max, u_max)
             return StepResult(u - offset, c.status, c.reason, h, phi, self._name(c.row))
         status = c.status
-        if status is Status.CORRECTING and c.row >= 0 and np.all(np.abs(dyn.v) <= RESTING_SPEED * self.robot.v_max):
+        if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
             status = Status.RESTING
         return StepResult(c.u - offset, status, c.reason, h, phi, self._name(c.row))
+
+    def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
+        """Hardly any speed, now and RESTING_TIME ahead under u."""
+        ahead = dyn.v + RESTING_TIME * dyn.Minv @ (u - dyn.b)
+        return bool(np.all(np.maximum(np.abs(dyn.v), np.abs(ahead)) <= RESTING_SPEED * self.robot.v_max))
 
     def _name(self, row: int) -> str:
         return self.safety.names[row] if row >= 0 else ""

@@ -1,0 +1,58 @@
+"""Initial parameters of K_theta, scaled to the domain X."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.problem import Problem
+
+Tensors = dict[str, torch.Tensor]
+CONSTANTS = ("in_shift", "in_scale", "v_scale", "zero_at_rest")  # parameters that are not trained
+
+
+def initial_parameters(problem: Problem, preset: Preset, generator: torch.Generator) -> Tensors:
+    """Parameters for the preset's network; K starts near zero, that is, near the LB barrier."""
+    shift, scale = _q_scaling(problem)
+    v_max = torch.tensor(abs(problem.robot.domain.v).max(axis=1), dtype=torch.float64)
+    if preset.network == "mlp":
+        shift = torch.cat([shift, torch.zeros(problem.model.nv, dtype=torch.float64)])
+        scale = torch.cat([scale, 1.0 / v_max])
+    p: Tensors = {"in_shift": shift, "in_scale": scale}
+    width = len(shift)
+    for i, units in enumerate(preset.hidden):
+        p[f"W{i}"], p[f"b{i}"] = _linear(width, units, generator)
+        width = units
+    if preset.network == "mlp":
+        p["w_out"] = _linear(width, 1, generator)[0][:, 0]
+        p["b_out"] = torch.zeros((), dtype=torch.float64)
+        p["zero_at_rest"] = torch.ones((), dtype=torch.float64)
+        return p
+    nv, units = problem.model.nv, preset.units
+    p["v_scale"] = 1.0 / v_max
+    p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -3.0, dtype=torch.float64)
+    p["Wc"], p["bc"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -1.0, dtype=torch.float64)
+    p["Wb"], _ = _linear(width, units * nv, generator)
+    p["bb"] = torch.randn(units * nv, generator=generator, dtype=torch.float64) * 2.0
+    return p
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """PyTorch's default initialisation of a linear layer, stored as (inputs, outputs)."""
+    bound = 1.0 / math.sqrt(inputs)
+    W = (2.0 * torch.rand(inputs, outputs, generator=generator, dtype=torch.float64) - 1.0) * bound
+    b = (2.0 * torch.rand(outputs, generator=generator, dtype=torch.float64) - 1.0) * bound
+    return W, b
+
+
+def _q_scaling(problem: Problem) -> tuple[torch.Tensor, torch.Tensor]:
+    """Shift and scale that map X to about [-1, 1]; cos and sin of continuous joints stay as they are."""
+    model, domain = problem.model, problem.robot.domain
+    shift, scale = torch.zeros(model.nq, dtype=torch.float64), torch.ones(model.nq, dtype=torch.float64)
+    for i in range(model.nv):
+        if not model.continuous[i]:
+            low, high = domain.q[i]
+            shift[model.idx_q[i]], scale[model.idx_q[i]] = 0.5 * (low + high), 2.0 / (high - low)
+    return shift, scale

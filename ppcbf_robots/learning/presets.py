@@ -1,0 +1,76 @@
+"""Training settings: the paper's and the recommended ones. No setting names a robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ppcbf_robots.filters import FilterKind, Metric
+from ppcbf_robots.network import NetworkKind
+
+PresetName = Literal["paper", "default"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Everything the learner can be told."""
+
+    network: NetworkKind
+    hidden: tuple[int, ...]
+    filter: FilterKind  # what the critic assumes will run
+    metric: Metric
+    learning_rate: float
+    units: int = 0  # convex network: number of terms
+    samples: int = 500  # N, new band states per iteration
+    epochs: int = 1  # E, gradient steps per iteration
+    top: int = 100  # k of Top_k
+    l2: float = 0.0  # weight of the L2 penalty (mean square of the weights)
+    volume_weight: float = 1.0  # of the regularisation term R, eq. (16)
+    critic_weight: float = 10.0  # initial λ of every constraint
+    critic_growth: float = 1.01  # factor on λ after an iteration with violations
+    critic_decay: float = 0.99  # factor on λ after one without
+    critic_bounds: tuple[float, float] = (1.0, 1000.0)
+    margin: float = 0.02  # dimensionless reserve the critics ask for in training
+    random_goals: float = 0.0  # share of states whose nominal torque aims at a random goal
+    rays: int = 20_000
+    rows_per_ray: int = 6
+    iterations: int = 1_000  # planned; the learning rate falls to a tenth over them
+    check_every: int = 50  # iterations between checks on fresh states
+    patience: int = 6  # clean checks in a row, without gain of volume, that end training early
+    refinements: int = 4  # further rounds when the final check finds violations
+    min_volume: float = 0.2  # of the LB set; less counts as collapsed
+    test_samples: int = 5_000  # uniform band states of the final check
+    changes: tuple[str, ...] = field(default=())  # departures from the paper, shown to the user
+
+
+PAPER = Preset(
+    network="mlp",
+    hidden=(100, 100, 100),
+    filter="closed-form",
+    metric="torque",
+    learning_rate=3e-4,
+    samples=1000,
+    top=200,
+    l2=1e-2,
+    iterations=2_000,
+    changes=(
+        "K is zero at rest: K = (f(q, v) - f(q, 0))^2 instead of f(q, v)^2, which lets every resting posture stay safe",
+        "critics are dimensionless: torque relative to its limit, power relative to u_max . v_max",
+        "the weights of the two critics adapt between 1 and 1000 instead of staying at 100; Top_k averages k = 200",
+        "learning rate 3e-4 instead of 1e-5, annealed to a tenth",
+        "states on the band come from rays in v instead of rejection, which finds 1 % of them",
+        "the exit looks at violations on fresh states and at the volume kept, since L < 0.01 cannot be met on the band",
+    ),
+)
+
+DEFAULT = Preset(
+    network="convex",
+    hidden=(64, 64),
+    units=12,
+    filter="qp",
+    metric="kinetic",
+    learning_rate=3e-3,
+    random_goals=0.5,
+)
+
+PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}

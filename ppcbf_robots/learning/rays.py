@@ -1,0 +1,165 @@
+"""Rays v = s d in velocity space: everything independent of theta, computed once with Pinocchio.
+
+Along a ray ``b = g + s² beta(d)`` and ``vᵀ ∇²h v = s² eta(d)``, so a pool of rays gives unlimited states without another
+call of Pinocchio, and bisection in s lands on any level of phi.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ppcbf_robots.barriers import BarrierRows, rho_rows
+from ppcbf_robots.network import NetworkKind, Params, value_along, value_and_grad
+from ppcbf_robots.problem import Problem
+from ppcbf_robots.robot import RobotModel
+from ppcbf_robots.specs import Array
+
+RayArrays = dict[str, Array]
+CHUNK = 2000  # configurations evaluated at once, to bound memory
+BISECTIONS = 12
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A pool (or selection) of B rays with R near rows each; tensors on one device."""
+
+    q: torch.Tensor  # (B, nq)
+    d: torch.Tensor  # (B, nv), from the origin to the face of X's velocity box
+    h: torch.Tensor  # (B, R)
+    grad: torch.Tensor  # (B, R, nv)
+    eta: torch.Tensor  # (B, R)
+    Minv: torch.Tensor  # (B, nv, nv)
+    g: torch.Tensor  # (B, nv)
+    beta: torch.Tensor  # (B, nv)
+    u_rest: torch.Tensor  # (B, nv)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def join(self, other: Rays) -> Rays:
+        """Both pools as one."""
+        return Rays(**{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in dataclasses.fields(self)})
+
+    def select(self, index: torch.Tensor) -> Rays:
+        """Some of the rays."""
+        return Rays(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
+
+
+@dataclass(frozen=True)
+class VolumeStates:
+    """Uniform states of X with h >= 0 and their least rho; phi_min there is ``rho - K``."""
+
+    q: torch.Tensor
+    v: torch.Tensor
+    rho: torch.Tensor
+
+
+class Field:
+    """K_theta and phi on torch states of one robot."""
+
+    def __init__(self, model: RobotModel, kind: NetworkKind, gamma: float, device: torch.device, dtype: torch.dtype):
+        self.kind, self.gamma = kind, gamma
+        self._const = torch.as_tensor(model.rate_const, device=device, dtype=dtype)
+        self._sign = torch.as_tensor(model.rate_sign, device=device, dtype=dtype)
+        self._partner = torch.as_tensor(model.rate_partner, device=device)
+        self._v_index = torch.as_tensor(model.rate_v, device=device)
+
+    def K(self, params: Params, q: torch.Tensor, v: torch.Tensor) -> tuple[Any, Any, Any]:
+        """K (B,), ∂K/∂q · q̇ (B,), ∂K/∂v (B, nv)."""
+        K, K_q, K_v = value_and_grad(torch, self.kind, params, q, v)
+        rate = (self._const + self._sign * q[..., self._partner]) * v[..., self._v_index]
+        return K, (K_q * rate).sum(-1), K_v
+
+    def rows(self, params: Params, rays: Rays, s: torch.Tensor) -> BarrierRows:
+        """All near rows at v = s d."""
+        v = s[:, None] * rays.d
+        K, K_q_rate, K_v = self.K(params, rays.q, v)
+        s2 = (s * s)[:, None]
+        return rho_rows(
+            rays.h, rays.grad, s2 * rays.eta, v, rays.Minv, rays.g + s2 * rays.beta, self.gamma, K, K_q_rate, K_v
+        )
+
+    @torch.no_grad()
+    def on_band(self, params: Params, rays: Rays, level: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """s with ``min_k phi_k(s) = level`` by bisection, and which rays cross that level at all."""
+        hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
+        K = value_along(torch, self.kind, params, rays.q, rays.d)
+
+        def above(s: torch.Tensor) -> torch.Tensor:
+            return (s[:, None] * hdot + self.gamma * rays.h).amin(-1) - K(s) >= level
+
+        low, high = torch.zeros_like(level), torch.ones_like(level)
+        crosses = above(low) & ~above(high)
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            ok = above(middle)
+            low, high = torch.where(ok, middle, low), torch.where(ok, high, middle)
+        return low, crosses
+
+
+def build_pool(
+    problem: Problem, count: int, rows: int, random_goals: float, rng: np.random.Generator
+) -> tuple[list[RayArrays], list[RayArrays]]:
+    """Sample rays, and the states on which volumes are measured, uniformly in q: two lists of chunks of arrays.
+
+    Args:
+        problem: robot and world.
+        count: free configurations wanted; fewer come back if X is almost all in collision.
+        rows: near rows kept per ray.
+        random_goals: share of rays whose nominal controller aims at a goal drawn from X instead of the problem's.
+        rng: source of randomness.
+    """
+    rays, volume = [], []
+    kept = tried = 0
+    domain = problem.robot.domain
+    while kept < count and (tried < 50 * CHUNK or kept > 0.002 * tried):
+        angles, v = domain.sample_q(rng, CHUNK), domain.sample_v(rng, CHUNK)
+        goals = np.where(
+            rng.random((CHUNK, 1)) < random_goals,
+            domain.sample_q(rng, CHUNK),
+            problem.model.to_angles(problem.robot.goal),
+        )
+        ray, states = rays_at(problem, problem.model.from_angles(angles), v, rows, goals)
+        rays.append(ray)
+        volume.append(states)
+        kept, tried = kept + len(ray["q"]), tried + CHUNK
+    return rays, volume
+
+
+def rays_at(
+    problem: Problem, q: Array, v: Array, rows: int, goal_angles: Array | None = None
+) -> tuple[RayArrays, RayArrays]:
+    """Rays through the states (q, v) that are free of collision, and those states with their least rho."""
+    gamma = problem.robot.spec.barrier.gamma
+    d = _to_face(v, problem.robot.domain.v)
+    dyn = problem.model.evaluate_batch(q, d)
+    safety = problem.safety.evaluate(dyn)
+    free = safety.h.min(axis=-1) >= 0.0
+    hdot = (safety.grad @ d[..., None])[..., 0]
+    nearest = np.argsort(gamma * safety.h + np.minimum(hdot, 0.0), axis=-1)[:, :rows]
+    pick = np.take_along_axis
+    rays = {
+        "q": q, "d": d, "Minv": dyn.Minv, "g": dyn.g, "beta": dyn.Cv,
+        "h": pick(safety.h, nearest, -1), "eta": pick(safety.curvature, nearest, -1),
+        "grad": pick(safety.grad, nearest[..., None], -2),
+        "u_rest": problem.robot.controller.u_rest(q, dyn.g, goal_angles),
+    }  # fmt: skip
+    rho = ((safety.grad @ v[..., None])[..., 0] + gamma * safety.h).min(axis=-1)
+    return {k: x[free] for k, x in rays.items()}, {"q": q[free], "v": v[free], "rho": rho[free]}
+
+
+def to_tensors(parts: list[RayArrays], device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    """Chunks of arrays as tensors by name."""
+    return {k: torch.as_tensor(np.concatenate([p[k] for p in parts]), device=device, dtype=dtype) for k in parts[0]}
+
+
+def _to_face(v: Array, box: Array) -> Array:
+    """Scale every v (B, nv) outwards until it touches the box (nv, 2)."""
+    limit = np.where(v >= 0.0, box[:, 1], box[:, 0])
+    reach = np.max(v / limit, axis=1, keepdims=True)
+    return np.asarray(v / np.maximum(reach, 1e-9))

@@ -1,0 +1,119 @@
+"""Robots in their worlds, loaded once, and what several test files need: random states, motions and networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from ppcbf_robots.barriers import Barrier, BarrierKind
+from ppcbf_robots.network import NetworkKind, NumpyNetwork
+from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.robot import Dynamics, RobotModel
+from ppcbf_robots.specs import Array
+
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
+
+PAIRS = {"cartpole": "wall", "two_link": "circle", "panda": "sphere", "kinova": "five_spheres"}
+BARRIERS = ["lb-cbf", "ncbf-mlp", "ncbf-convex", "pp-ncbf-mlp", "pp-ncbf-convex", "pp-cbf"]
+
+States = Callable[..., Iterator[tuple[Array, Array]]]
+AlongMotion = Callable[..., tuple[Dynamics, Dynamics]]
+
+
+@pytest.fixture(scope="session")
+def problems() -> dict[str, Problem]:
+    """Every robot of the tests in its world, by the robot's name; kinova has continuous joints."""
+    return {robot: load_problem(robot, world) for robot, world in PAIRS.items()}
+
+
+@pytest.fixture(params=PAIRS)
+def problem(request: pytest.FixtureRequest, problems: dict[str, Problem]) -> Problem:
+    """Each problem in turn."""
+    return problems[request.param]
+
+
+@pytest.fixture
+def cartpole(problems: dict[str, Problem]) -> Problem:
+    return problems["cartpole"]
+
+
+@pytest.fixture
+def two_link(problems: dict[str, Problem]) -> Problem:
+    return problems["two_link"]
+
+
+@pytest.fixture
+def panda(problems: dict[str, Problem]) -> Problem:
+    return problems["panda"]
+
+
+@pytest.fixture
+def kinova(problems: dict[str, Problem]) -> Problem:
+    return problems["kinova"]
+
+
+@pytest.fixture(scope="session")
+def states() -> States:
+    """``states(problem, count, seed)`` yields uniform (q, v) of the domain X."""
+
+    def draw(problem: Problem, count: int, seed: int = 0) -> Iterator[tuple[Array, Array]]:
+        rng, domain = np.random.default_rng(seed), problem.robot.domain
+        return zip(problem.model.from_angles(domain.sample_q(rng, count)), domain.sample_v(rng, count), strict=True)
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def along_motion() -> AlongMotion:
+    """``along_motion(model, q, v, a, dt)``: the evaluations dt before and after (q, v) at acceleration a.
+
+    Their difference over 2 dt is the time derivative of any smooth function of (q, v), up to dt².
+    """
+
+    def evaluate(model: RobotModel, q: Array, v: Array, a: Array, dt: float = 1e-5) -> tuple[Dynamics, Dynamics]:
+        before, after = (model.evaluate(model.integrate(q, s * v + 0.5 * s * s * a), v + s * a) for s in (-dt, dt))
+        return before, after
+
+    return evaluate
+
+
+@pytest.fixture(scope="session")
+def random_network() -> Callable[..., NumpyNetwork]:
+    """``random_network(kind, nq, nv, seed)``: K_theta with random weights of the right shapes."""
+
+    def build(kind: NetworkKind, nq: int, nv: int, seed: int = 0, width: int = 16, units: int = 5) -> NumpyNetwork:
+        rng = np.random.default_rng(seed)
+        inputs = nq + nv if kind == "mlp" else nq
+        heads = {"w_out": (width,)} if kind == "mlp" else {
+            "Wa": (width, units), "Wb": (width, units * nv), "Wc": (width, units),
+            "ba": (units,), "bb": (units * nv,), "bc": (units,)}  # fmt: skip
+        layers = {"W0": (inputs, width), "b0": (width,), "W1": (width, width), "b1": (width,)}
+        params = {name: rng.normal(0.0, 0.4, shape) for name, shape in {**layers, **heads}.items()}
+        params |= {"in_shift": rng.normal(0.0, 0.1, inputs), "in_scale": rng.uniform(0.5, 1.5, inputs)}
+        params |= {"b_out": np.array(0.3), "zero_at_rest": np.array(1.0)} if kind == "mlp" else {
+            "v_scale": rng.uniform(0.5, 1.5, nv)}  # fmt: skip
+        return NumpyNetwork(kind, params)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def make_barrier(random_network: Callable[..., NumpyNetwork]) -> Callable[..., Barrier]:
+    """``make_barrier(problem, name)`` for the names of BARRIERS: a kind, with the form of its random network."""
+
+    def build(problem: Problem, name: str, seed: int = 0) -> Barrier:
+        kind: BarrierKind = name.removesuffix("-mlp").removesuffix("-convex")  # type: ignore[assignment]
+        form = name.removeprefix(f"{kind}-") if kind != name else None
+        return problem.barrier(kind, random_network(form, problem.model.nq, problem.model.nv, seed) if form else None)
+
+    return build
+
+
+@pytest.fixture(params=BARRIERS)
+def barrier_name(request: pytest.FixtureRequest) -> str:
+    """Each barrier in turn, the learned ones with both forms of network."""
+    return str(request.param)
