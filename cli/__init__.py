@@ -1,0 +1,1 @@
+"""The ``ppcbf`` command: results on stdout, progress and errors on stderr."""

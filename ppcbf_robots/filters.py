@@ -232,6 +232,8 @@ class QPFilter:
     def _least_violation(self, dyn: Dynamics, C: Array, lower: Array, box: Box, u_max: Array) -> Array | None:
         """Torque in the box with the least worst violation: one slack shared by all rows, heavily weighted."""
         n = len(u_max)
+        reach = np.maximum(C * box[0], C * box[1]).sum(-1)
+        lower = lower - np.max(lower - reach, initial=0.0)  # violated in any case, and perhaps by a huge amount
         near = np.sort(np.argsort(-lower, kind="stable")[: self.config.near_rows])
         H = np.zeros((n + 1, n + 1))
         H[:n, :n] = self._hessian(dyn, u_max)

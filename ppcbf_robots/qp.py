@@ -43,7 +43,7 @@ class ProxQPSolver:
     changed, ends "solved" up to 2 % of u_max away from the optimum, or reports a feasible problem as infeasible.
     """
 
-    def __init__(self, eps: float = 1e-8, max_iter: int = 50) -> None:
+    def __init__(self, eps: float = 1e-8, max_iter: int = 100) -> None:
         self.eps, self.max_iter = eps, max_iter
         self._workspaces: dict[tuple[int, int], Any] = {}
 
@@ -66,8 +66,8 @@ class ProxQPSolver:
             qp = proxqp.dense.QP(n, 0, m, True, proxqp.dense.HessianType.Dense)
             qp.settings.eps_abs, qp.settings.eps_rel = self.eps, 0.0
             qp.settings.check_duality_gap = True  # or it stops with active rows 1e-3 loose, up to 2 % of u_max off
-            qp.settings.eps_duality_gap_abs, qp.settings.eps_duality_gap_rel = self.eps, 0.0
-            qp.settings.max_iter = qp.settings.max_iter_in = self.max_iter  # infeasible problems use them up
+            qp.settings.eps_duality_gap_abs = qp.settings.eps_duality_gap_rel = self.eps
+            qp.settings.max_iter, qp.settings.max_iter_in = self.max_iter, 50  # infeasible problems use them up
             qp.settings.initial_guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS
             qp.settings.compute_timings = False
             qp.init(*arguments)

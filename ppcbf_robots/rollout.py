@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,7 @@ from ppcbf_robots.specs import Array
 
 RK4_STEP = 5e-4  # [s], the paper's T_s
 GOAL_TOLERANCE = 0.05  # [rad | m]
+NEAR = 0.05  # [m], clearance below which an arm counts as passing an obstacle
 V_FLOOR = 0.01  # [J], least storage that energy rises are compared with
 
 
@@ -60,8 +63,11 @@ class Trajectory:
                 meta = json.loads(str(file["meta"]))
         except FileNotFoundError:
             raise InputError(f"trajectory not found: {path}") from None
-        except (KeyError, ValueError, OSError, EOFError) as error:
+        except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a trajectory of `ppcbf simulate` ({error})") from None
+        fits = isinstance(meta, dict) and {"goal", "rests_on"} <= meta.keys()
+        if not fits or len({x.shape[:1] for x in data.values()}) != 1:
+            raise InputError(f"{path}: not a trajectory of `ppcbf simulate` (its fields do not belong together)")
         return Trajectory(**data, meta=meta)
 
     def summary(self, model: RobotModel) -> dict[str, Any]:
@@ -78,9 +84,16 @@ class Trajectory:
             "injected": float(np.maximum(np.diff(self.V), 0.0).sum()),
             "reached_goal": error < GOAL_TOLERANCE,
             "goal_error": error,
+            "cleared_at": self._cleared_at(),
             "rests_on": self.meta["rests_on"],
-            "filter_counts": {Status(s).name.lower(): int(n) for s, n in zip(*np.unique(self.status, return_counts=True), strict=True)},
+            "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
+
+
+    def _cleared_at(self) -> float | None:
+        """Time [s] after which the clearance stays above 5 cm; None if it never fell below, or never rose again."""
+        near = np.flatnonzero(self.clearance <= NEAR)
+        return float(self.t[near[-1] + 1]) if near.size and near[-1] + 1 < len(self.t) else None
 
 
 def simulate(

@@ -11,6 +11,8 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.specs import read_text
 
 MAX_LINKS = 1000
+XACRO = "this is a xacro file; expand it first with `xacro file.xacro > robot.urdf`"
+NUMERIC = ("xyz", "rpy", "size", "radius", "length", "scale")
 
 
 @dataclass(frozen=True)
@@ -33,16 +35,19 @@ def check_urdf(path: Path) -> UrdfFacts:
     try:
         root = ElementTree.fromstring(text)  # noqa: S314 - entities were refused above
     except ElementTree.ParseError as error:
-        raise InputError(f"{path}: not valid XML ({error})") from None
+        raise InputError(f"{path}: {XACRO if '<xacro:' in text else f'not valid XML ({error})'}") from None
+    if any("xacro" in element.tag for element in root.iter()):
+        raise InputError(f"{path}: {XACRO}")
     if root.tag != "robot":
-        hint = "; expand it first with `xacro file.xacro > robot.urdf`" if "xacro" in text[:2000] else ""
-        raise InputError(f"{path}: the root element is <{root.tag}>, a URDF's is <robot>{hint}")
+        raise InputError(f"{path}: the root element is <{root.tag}>, a URDF's is <robot>")
     links = root.findall("link")
     if not links:
         raise InputError(f"{path}: the URDF has no <link>")
     if len(links) > MAX_LINKS:
         raise InputError(f"{path}: {len(links)} links; at most {MAX_LINKS} are read")
     _check_tree(path, root, [str(link.get("name")) for link in links])
+    for part in root:
+        _check_geometry(path, part)
     for link in links:
         _check_inertial(path, link)
     mimics = tuple(str(j.get("name")) for j in root.findall("joint") if j.find("mimic") is not None)
@@ -70,6 +75,12 @@ def _check_tree(path: Path, root: ElementTree.Element, links: list[str]) -> None
     if len(roots) != 1:
         shown = ", ".join(f"'{r}'" for r in roots[:3]) or "none"
         raise InputError(f"{path}: a URDF has one root link, this one has {len(roots)} ({shown})")
+    reached = {roots[0]}
+    for _ in links:
+        reached |= {child for child, parent in parents.items() if parent in reached}
+    for link in links:
+        if link not in reached:
+            raise InputError(f"{path}: link '{link}' hangs in a loop of joints that does not start at '{roots[0]}'")
 
 
 def _check_axis_and_limits(path: Path, joint: ElementTree.Element, name: str) -> None:
@@ -82,10 +93,24 @@ def _check_axis_and_limits(path: Path, joint: ElementTree.Element, name: str) ->
             raise InputError(f"{path}: joint '{name}': the axis must be a vector of three numbers, not all zero")
     limit = joint.find("limit")
     if limit is None:
+        if joint.get("type") in ("revolute", "prismatic"):
+            raise InputError(f"{path}: joint '{name}' has no <limit>; give it one with lower, upper, effort and velocity")
         return
+    for k in ("effort", "velocity"):
+        if limit.get(k) is None:
+            raise InputError(f"{path}: joint '{name}': its <limit> has no {k}; write one, such as {k}=\"10\"")
+        _number(path, str(limit.get(k)), f"joint '{name}', limit {k}")
     low, high = (_number(path, limit.get(k) or "0", f"joint '{name}', limit {k}", True) for k in ("lower", "upper"))
     if low > high:
         raise InputError(f"{path}: joint '{name}': lower limit {low} is above upper limit {high}; swap them")
+
+
+def _check_geometry(path: Path, part: ElementTree.Element) -> None:
+    """Placements and shapes of a link or joint: numbers only, for NaN in one of them would spread unseen."""
+    for element in part.iter():
+        for key in NUMERIC:
+            for text in (element.get(key) or "").split():
+                _number(path, text, f"{part.tag} '{part.get('name')}', {element.tag} {key}")
 
 
 def _check_inertial(path: Path, link: ElementTree.Element) -> None:

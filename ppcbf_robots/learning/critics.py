@@ -62,7 +62,8 @@ def feasibility_margin(
     fixed for the gradient (envelope theorem), the margin of the combined row is exact.
     """
     authority = (rows.Lg_phi.abs() * u_max).sum(-1) + _TINY
-    offset = (rows.Lf_phi + alpha * rows.phi) / authority  # (B, R)
+    level = rows.phi.detach()  # states are drawn at a level of phi: moving the level is no way to gain margin
+    offset = (rows.Lf_phi + alpha * level) / authority  # (B, R)
     c = rows.Lg_phi / authority[..., None]  # (B, R, nv)
     budget = (v * u_des).sum(-1) + d_p if passive else None  # (B,): vᵀu <= budget
     with torch.no_grad():

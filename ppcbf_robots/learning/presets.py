@@ -30,11 +30,11 @@ class Preset:
     critic_growth: float = 1.01  # factor on λ after an iteration with violations
     critic_decay: float = 0.99  # factor on λ after one without
     critic_bounds: tuple[float, float] = (1.0, 1000.0)
-    margin: float = 0.02  # dimensionless reserve the critics ask for in training
+    margin: float = 0.03  # dimensionless reserve the critics ask for in training
     random_goals: float = 0.0  # share of states whose nominal torque aims at a random goal
     rays: int = 20_000
     rows_per_ray: int = 6
-    iterations: int = 1_000  # planned; the learning rate falls to a tenth over them
+    iterations: int = 800  # planned; the learning rate falls to a tenth over them
     check_every: int = 50  # iterations between checks on fresh states
     patience: int = 6  # clean checks in a row, without gain of volume, that end training early
     refinements: int = 4  # further rounds when the final check finds violations

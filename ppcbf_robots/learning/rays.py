@@ -22,6 +22,7 @@ from ppcbf_robots.specs import Array
 RayArrays = dict[str, Array]
 CHUNK = 2000  # configurations evaluated at once, to bound memory
 BISECTIONS = 12
+FAR = 5.0  # [m/s], rho above which a row cannot matter
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,12 @@ class Rays:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    def without_far_rows(self, gamma: float) -> Rays:
+        """Drop trailing rows whose phi stays far above the band on every ray, such as limits nobody comes near."""
+        closest = (gamma * self.h + torch.relu(-(self.grad @ self.d[..., None])[..., 0]).neg()).amin(0)
+        count = max(1, int((closest <= FAR).sum()))
+        return dataclasses.replace(self, h=self.h[:, :count], grad=self.grad[:, :count], eta=self.eta[:, :count])
 
     def join(self, other: Rays) -> Rays:
         """Both pools as one."""

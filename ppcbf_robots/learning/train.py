@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.critics import closed_form_critics, feasibility_margin
-from ppcbf_robots.learning.evidence import BandCheck, check_band
+from ppcbf_robots.evidence import POWER_TOLERANCE, BandCheck, check_band
 from ppcbf_robots.learning.parameters import CONSTANTS, Tensors, initial_parameters
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Field, Rays, VolumeStates, build_pool, rays_at, to_tensors
@@ -25,7 +26,6 @@ from ppcbf_robots.specs import Array
 
 LearnedKind = Literal["ncbf", "pp-ncbf"]
 CHECK_STATES = 4_000
-CLEAN_TOLERANCE = 1e-4  # dimensionless critic that still counts as zero on the band
 COUNTEREXAMPLE_COPIES = 50  # how often a counterexample's ray stands in the pool
 CANDIDATES = 3  # clean parameter sets tried in the final check
 MAX_REFINED_MARGIN = 0.1
@@ -80,6 +80,15 @@ class Result:
         }
 
 
+@dataclass(frozen=True)
+class Tested:
+    """Parameters and what the runtime filter did with them on uniform band states."""
+
+    params: dict[str, Array]
+    check: BandCheck
+    volume_kept: float
+
+
 class Trainer:
     """Trains K_theta for one problem.
 
@@ -95,7 +104,7 @@ class Trainer:
     """
 
     def __init__(self, problem: Problem, kind: LearnedKind, preset: Preset, seed: int = 0, device: str = "cpu") -> None:
-        self.problem, self.kind, self.preset = problem, kind, preset
+        self.problem, self.kind, self.preset, self.seed = problem, kind, preset, seed
         self.spec = problem.robot.spec.barrier
         self.device, self.dtype = torch.device(device), torch.float32
         self.generator = torch.Generator().manual_seed(seed)
@@ -128,8 +137,12 @@ class Trainer:
         free = sum(len(r["q"]) for r in rays)
         if free < 200:
             raise InputError("almost every configuration of the domain X is in collision; shrink X or move the obstacles")
-        return (Rays(**to_tensors(rays, self.device, self.dtype)),
-                VolumeStates(**to_tensors(volume, self.device, self.dtype)))  # fmt: skip
+        pool = Rays(**to_tensors(rays, self.device, self.dtype))
+        return pool.without_far_rows(self.spec.gamma), VolumeStates(**to_tensors(volume, self.device, self.dtype))
+
+    def identity(self) -> str:
+        """What a checkpoint must share with this run to be resumed."""
+        return json.dumps([self.problem.fingerprint(), self.spec.model_dump(), self.kind, settings(self.preset), self.seed])
 
     def run(
         self,
@@ -142,21 +155,24 @@ class Trainer:
         KeyboardInterrupt ends training and checks the best barrier so far.
         """
         interrupted = False
-        check = BandCheck(0, 0, 0)
-        best: dict[str, Array] | None = None
+        tested: list[Tested] = []
         for round_ in range(self.preset.refinements + 1):
             try:
                 self._descend(on_check, time_limit)
             except KeyboardInterrupt:
                 interrupted = True
-            best, check = self._final_check()
+            found = self._final_check()
+            tested = sorted([*tested, *found], key=lambda t: (t.check.share, -t.volume_kept))
             out_of_time = time.monotonic() - self.started > time_limit
-            if (check.samples and not check.violations) or interrupted or out_of_time or round_ == self.preset.refinements:
+            done = bool(tested) and tested[0].check.violations == 0
+            if done or interrupted or out_of_time or round_ == self.preset.refinements:
                 break
-            self._refine()
+            self._refine(found)
             if on_refine is not None:
-                on_refine(f"{check.violations} of {check.samples} band states violated: refining")
-        return self._result(best or self._snapshot(), check, interrupted)
+                share = f"{found[-1].check.violations} of {found[-1].check.samples}" if found else "too many"
+                on_refine(f"{share} uniform band states violate: refining")
+        best = tested[0] if tested else Tested(self._snapshot(), BandCheck(0, 0, 0), 0.0)
+        return self._result(best.params, best.check, interrupted)
 
     def _descend(self, on_check: Callable[[Monitor], None] | None, time_limit: float) -> None:
         """Lines 2 to 12 of Algorithm 1."""
@@ -237,7 +253,7 @@ class Trainer:
         torque = passivity = 0.0
         if len(index):
             _, t, e = self._critics(self.rays.select(index), s, 0.0)
-            torque, passivity = (float((x > CLEAN_TOLERANCE).float().mean()) for x in (t, e))
+            torque, passivity = (float((x > limit).float().mean()) for x, limit in ((t, 1e-4), (e, POWER_TOLERANCE)))
         snapshot = self._snapshot()
         monitor = Monitor(
             self.iteration, self.planned, self._volume_kept(), found, torque, passivity,
@@ -270,28 +286,28 @@ class Trainer:
             return False
         return max(m.volume_kept for m in last) - last[0].volume_kept < 2e-3
 
-    def _final_check(self) -> tuple[dict[str, Array] | None, BandCheck]:
+    def _final_check(self) -> list[Tested]:
         """Run the filter on uniform band states for the largest clean candidates until one has no violation."""
-        check, params = BandCheck(0, 0, 0), None
-        self._counterexamples: list[tuple[Array, Array]] = []
-        for _, params in self.clean:
+        tested = []
+        for volume, params in self.clean:
             barrier = self.problem.barrier(self.kind, NumpyNetwork(self.preset.network, params))
             check = check_band(
                 self.problem, barrier, self.filter_config, self.preset.test_samples, self.rng, self.kind == "pp-ncbf"
             )
+            if check.samples:
+                tested.append(Tested(params, check, volume))
             if check.samples and not check.violations:
-                return params, check
-            self._counterexamples.append((check.bad_q, check.bad_v))
-        return params, check
+                break
+        return tested
 
-    def _refine(self) -> None:
+    def _refine(self, tested: list[Tested]) -> None:
         """Counterexamples join the pool, the margin grows, and training goes on for half as long."""
         self.clean = []
         self.margin = min(MAX_REFINED_MARGIN, 1.5 * self.margin)
         self.planned = self.iteration + self.preset.iterations // 2
-        q, v = (np.concatenate(x) for x in zip(*self._counterexamples, strict=True)) if self._counterexamples else ([], [])
-        if len(q):
-            rays, _ = rays_at(self.problem, q, v, self.preset.rows_per_ray)
+        if any(t.check.violations for t in tested):
+            q, v = (np.concatenate([getattr(t.check, k) for t in tested]) for k in ("bad_q", "bad_v"))
+            rays, _ = rays_at(self.problem, q, v, self.rays.h.shape[1])
             found = Rays(**to_tensors([rays], self.device, self.dtype))
             copies = torch.arange(len(found), device=self.device).repeat(COUNTEREXAMPLE_COPIES)
             self.rays = self.rays.join(found.select(copies))
@@ -309,7 +325,7 @@ class Trainer:
             reason = "collapsed: no state was found on the band"
         elif check.violations:
             reason = f"{check.violations} of {check.samples} uniform band states violate the limits"
-        elif not start_inside:
+        elif not start_inside and self.problem.safety.least(self.problem.robot.start)[0] >= 0.0:
             reason = "the start state lies outside the safe set"
         else:
             reason = "interrupted; the best barrier so far is clean" if interrupted else "clean"
@@ -319,5 +335,5 @@ class Trainer:
 
 
 def settings(preset: Preset) -> dict[str, Any]:
-    """A preset as plain data, for the training report."""
-    return dataclasses.asdict(preset)
+    """A preset as plain JSON data, for the training report."""
+    return {k: list(x) if isinstance(x, tuple) else x for k, x in dataclasses.asdict(preset).items()}

@@ -75,6 +75,20 @@ def _least_phi(problem: Problem, barrier: Barrier, q: Array, h: Array, grad: Arr
     return np.asarray(rho - K)
 
 
+def volume_ratio(
+    problem: Problem, barrier: Barrier, reference: Barrier, rng: np.random.Generator, count: int = 10_000
+) -> float:
+    """Volume in X of ``{h >= 0, min_k phi_k >= 0}`` of a barrier over that of a reference, by uniform samples."""
+    inside = np.zeros(2)
+    for _ in range(-(-count // CHUNK)):
+        q = problem.model.from_angles(problem.robot.domain.sample_q(rng, CHUNK))
+        dyn = problem.model.evaluate_batch(q, problem.robot.domain.sample_v(rng, CHUNK))
+        safety = problem.safety.evaluate(dyn)
+        free = safety.h.min(axis=-1) >= 0.0
+        inside += [np.sum(free & (b.rows(dyn, safety).phi.min(axis=-1) >= 0.0)) for b in (barrier, reference)]
+    return float(inside[0] / max(inside[1], 1.0))
+
+
 def check_band(
     problem: Problem,
     barrier: Barrier,

@@ -1,0 +1,150 @@
+"""``ppcbf compare``: the four barriers side by side on one robot and world."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, table, yes
+from ppcbf_robots.cli.simulate import choose_barrier, run
+from ppcbf_robots.cli.train import Device, Kind, PresetChoice, train_barrier
+from ppcbf_robots.errors import CheckFailed, InputError
+from ppcbf_robots.evidence import volume_ratio
+from ppcbf_robots.filters import FilterKind, Metric
+from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.rollout import Trajectory
+
+KEYS = ("volume_kept", "min_h", "max_torque_ratio", "energy_rise", "injected", "cleared_at", "reached_goal", "rests_on")
+
+
+class Case(NamedTuple):
+    """One row of the table."""
+
+    label: str
+    barrier: str  # kind, or folder
+    filter: FilterKind
+    metric: Metric
+
+
+def compare(
+    robot: RobotArgument,
+    obstacles: WorldArgument,
+    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for table, plots, barriers, runs.")],
+    preset: Annotated[PresetChoice, typer.Option(help="Training settings of the two learned barriers.")] = "paper",
+    seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
+    duration: Annotated[float, typer.Option(min=0.1, help="[s]")] = 15.0,
+    device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
+    iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
+    reuse: Annotated[bool, typer.Option(help="Take barriers already in DIR if they fit.")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Train NCBF and PP-NCBF, run all four barriers from the same start, write a table and the paper's plots.
+
+    LB-CBF, NCBF, PP-CBF and PP-NCBF run as in the paper (closed form, torque metric); PP-NCBF and LB-CBF also run as
+    the QP in the kinetic metric. Exits with 3 if a training did not converge.
+
+    Example: ppcbf compare cartpole wall --out runs/compare
+    """
+    problem = load_problem(robot, obstacles)
+    problem.check_start(problem.robot.start)
+    if out_dir.exists() and not out_dir.is_dir():
+        raise InputError(f"--out: {out_dir} is a file; give a folder")
+    kinds: tuple[Kind, ...] = ("ncbf", "pp-ncbf")
+    failed = []
+    for kind in kinds:
+        folder = out_dir / kind
+        if reuse and _fits(folder, problem, preset, seed):
+            err.print(f"[dim]{kind}: taken from {folder}[/]")
+            continue
+        report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
+        failed += [] if report["converged"] else [f"{kind}: {report['reason']}"]
+    rows, runs, barriers = _run_all(problem, out_dir, duration)
+    files = _write(problem, rows, runs, barriers, out_dir)
+    if json:
+        emit_json({"rows": rows, "files": files})
+    else:
+        _print(problem, rows, files)
+    if failed:
+        raise CheckFailed(f"not converged: {'; '.join(failed)}")
+
+
+def _fits(folder: Path, problem: Problem, preset: str, seed: int) -> bool:
+    try:
+        stored = load_barrier(folder)
+        stored.barrier(problem)
+    except InputError:
+        return False
+    training = stored.data["training"]
+    return stored.spec == problem.robot.spec.barrier and (training.get("preset"), training.get("seed")) == (preset, seed)
+
+
+def _cases(out_dir: Path) -> list[Case]:
+    ncbf, pp = str(out_dir / "ncbf"), str(out_dir / "pp-ncbf")
+    return [
+        Case("LB-CBF", "lb-cbf", "closed-form", "torque"),
+        Case("NCBF", ncbf, "closed-form", "torque"),
+        Case("PP-CBF", "pp-cbf", "closed-form", "torque"),
+        Case("PP-NCBF", pp, "closed-form", "torque"),
+        Case("PP-CBF kinetic", "pp-cbf", "closed-form", "kinetic"),
+        Case("LB-CBF kinetic QP", "lb-cbf", "qp", "kinetic"),
+        Case("PP-NCBF kinetic QP", pp, "qp", "kinetic"),
+    ]
+
+
+def _run_all(
+    problem: Problem, out_dir: Path, duration: float
+) -> tuple[list[dict[str, Any]], dict[str, Trajectory], dict[str, Barrier]]:
+    rows, runs, barriers = [], {}, {}
+    robot = problem.robot
+    for case in _cases(out_dir):
+        barrier, config = choose_barrier(problem, case.barrier, case.filter, case.metric)
+        assert barrier is not None
+        meta = {"barrier": case.barrier, "label": case.label}
+        trajectory = run(problem, barrier, config, robot.start, robot.start_velocity, duration, meta)
+        name = case.label.lower().replace(" ", "_")
+        trajectory.save(out_dir / f"{name}.npz")
+        facts = trajectory.summary(problem.model)
+        facts["volume_kept"] = volume_ratio(problem, barrier, problem.barrier("lb-cbf"), np.random.default_rng(0))
+        rows.append({"label": case.label, "filter": case.filter, "metric": case.metric} | {k: facts[k] for k in KEYS})
+        runs[case.label], barriers[case.label] = trajectory, barrier
+    return rows, runs, barriers
+
+
+def _write(
+    problem: Problem, rows: list[dict[str, Any]], runs: dict[str, Trajectory], barriers: dict[str, Barrier], out_dir: Path
+) -> list[str]:
+    from ppcbf_robots import plots  # matplotlib only where it is needed
+
+    with (out_dir / "table.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    plots.plot_runs(problem, runs, out_dir / "runs.png")
+    plots.plot_paths(problem, runs, out_dir / "paths.png")
+    files = ["table.csv", "runs.png", "paths.png"]
+    if problem.model.nv >= 2:
+        v = problem.robot.domain.v
+        velocities = [np.zeros(len(v)), 0.5 * np.minimum(v[:, 1], 1.0)]
+        shown = {k: b for k, b in barriers.items() if k in ("LB-CBF", "NCBF", "PP-CBF", "PP-NCBF")}
+        plots.plot_safe_set(problem, shown, velocities, out_dir / "safe_set.png")
+        files.append("safe_set.png")
+    return [str(out_dir / f) for f in files]
+
+
+def _print(problem: Problem, rows: list[dict[str, Any]], files: list[str]) -> None:
+    columns = ["barrier", "filter", "metric", "volume", "least h", "|u|/u_max", "V rise / V0", "injected [J]", "clear [s]",
+               "goal"]  # fmt: skip
+    cells = [
+        [r["label"], r["filter"], r["metric"], "-" if r["volume_kept"] is None else f"{r['volume_kept']:.1%}",
+         number(r["min_h"]), number(r["max_torque_ratio"], 3), f"{r['energy_rise']:.1e}", number(r["injected"], 3),
+         number(r["cleared_at"]), "yes" if r["reached_goal"] else (f"rests on {r['rests_on']}" if r["rests_on"] else yes(False))]
+        for r in rows
+    ]  # fmt: skip
+    table(f"{problem.robot.name} in {problem.world_name}", columns, cells)
+    out.print("wrote " + ", ".join(files))

@@ -1,0 +1,53 @@
+"""Entry point of the ``ppcbf`` command."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+
+import typer
+
+from ppcbf_robots.cli.compare import compare
+from ppcbf_robots.cli.export import export
+from ppcbf_robots.cli.info import info
+from ppcbf_robots.cli.output import err
+from ppcbf_robots.cli.simulate import simulate
+from ppcbf_robots.cli.train import train
+from ppcbf_robots.cli.view import view
+from ppcbf_robots.errors import PPCBFError
+
+app = typer.Typer(
+    name="ppcbf",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
+    "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed.",
+)
+for command in (info, train, simulate, compare, view, export):
+    app.command()(command)
+
+
+def main() -> None:
+    """Run the command line; every expected error ends as one sentence and its exit code."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", stream=sys.stderr)
+    try:
+        app()
+    except PPCBFError as error:
+        err.print(f"[bold red]error:[/] {_escape(str(error))}", soft_wrap=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        err.print("stopped")
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+def _escape(text: str) -> str:
+    return text.replace("[", r"\[")
+
+
+if __name__ == "__main__":
+    main()

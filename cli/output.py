@@ -1,0 +1,54 @@
+"""Printing for people and for programs, and the exit codes."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+out = Console(highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False)
+
+RobotArgument = Annotated[
+    str, typer.Argument(metavar="ROBOT", help="Bundled name, robot spec (YAML), URDF path, or example-robot-data name.")
+]
+WorldArgument = Annotated[str, typer.Argument(metavar="OBSTACLES", help="Bundled world name or YAML path.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout instead of text.")]
+
+
+def emit_json(data: dict[str, Any]) -> None:
+    """One JSON object on stdout; NaN becomes null, as JSON has none."""
+    typer.echo(json.dumps(_plain(data), indent=2))
+
+
+def _plain(x: Any) -> Any:
+    if isinstance(x, dict):
+        return {str(k): _plain(y) for k, y in x.items()}
+    if isinstance(x, list | tuple):
+        return [_plain(y) for y in x]
+    if isinstance(x, float) and x != x:
+        return None
+    return x.item() if hasattr(x, "item") else x
+
+
+def table(title: str, columns: list[str], rows: list[list[str]]) -> None:
+    """A table on stdout."""
+    t = Table(title=title, title_justify="left", title_style="bold")
+    for i, name in enumerate(columns):
+        t.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
+    for row in rows:
+        t.add_row(*row)
+    out.print(t)
+
+
+def number(x: float | None, digits: int = 4) -> str:
+    """A number for a table, or a dash."""
+    return "-" if x is None else f"{x:.{digits}g}"
+
+
+def yes(x: bool) -> str:
+    """A truth value for a table."""
+    return "yes" if x else "no"

@@ -1,0 +1,131 @@
+"""``ppcbf simulate``: one closed-loop run with or without a filter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import track
+
+from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
+from ppcbf_robots.errors import CheckFailed, InputError
+from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
+from ppcbf_robots.problem import Problem, load_problem, parse_vector
+from ppcbf_robots.rollout import Trajectory
+from ppcbf_robots.rollout import simulate as rollout
+from ppcbf_robots.safety_filter import SafetyFilter
+from ppcbf_robots.specs import Array, vector
+
+
+def simulate(
+    robot: RobotArgument,
+    obstacles: WorldArgument,
+    barrier: Annotated[str, typer.Option(help="Barrier folder, or lb-cbf, pp-cbf, none.")] = "lb-cbf",
+    filter: Annotated[FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")] = None,
+    metric: Annotated[Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")] = None,
+    solver: Annotated[str, typer.Option(help="proxqp, or a solver installed for qpsolvers.")] = "proxqp",
+    start: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
+    velocity: Annotated[str | None, typer.Option(metavar="V,...", help="Start velocity.")] = None,
+    goal: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
+    duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="[s]")] = 10.0,
+    rate: Annotated[float, typer.Option(min=10.0, max=2000.0, help="Control rate [Hz].")] = 1000.0,
+    out_file: Annotated[Path, typer.Option("--out", metavar="T.npz")] = Path("trajectory.npz"),
+    json: JsonOption = False,
+) -> None:
+    """Simulate the filtered arm and write the trajectory.
+
+    Example: ppcbf simulate panda sphere --barrier runs/panda --duration 5 --out runs/panda.npz
+    """
+    problem = load_problem(robot, obstacles)
+    model = problem.model
+    q = _angles(problem, start, "--start", problem.robot.start)
+    given = parse_vector(velocity, "--velocity")
+    rest = start is not None  # the spec's start velocity belongs to the spec's start
+    v = vector(given, model.nv, "--velocity") if given is not None else problem.robot.start_velocity * (not rest)
+    if goal is not None:
+        problem = problem.with_goal(_angles(problem, goal, "--goal", problem.robot.goal))
+    problem.check_start(q)
+    if out_file.is_dir():
+        raise InputError(f"--out: {out_file} is a folder; give a file such as {out_file}/trajectory.npz")
+    chosen, config = choose_barrier(problem, barrier, filter, metric, solver, 1.0 / rate)
+    trajectory = run(problem, chosen, config, q, v, duration, {"barrier": barrier})
+    trajectory.save(out_file)
+    facts = trajectory.summary(model) | {"out": str(out_file)}
+    emit_json(facts) if json else _print(facts, trajectory, problem)
+    if not trajectory.meta["complete"]:
+        raise CheckFailed(f"the simulation diverged at {trajectory.t[-1]:.3f} s; {out_file} holds what there is")
+
+
+def choose_barrier(
+    problem: Problem, name: str, kind: FilterKind | None, metric: Metric | None, solver: str = "proxqp", dt: float = 1e-3
+) -> tuple[Barrier | None, FilterConfig]:
+    """A barrier by name or folder, and the filter settings that go with it unless others are asked for."""
+    if name == "none":
+        return None, FilterConfig(dt=dt)
+    if name == "lb-cbf" or name == "pp-cbf":
+        kind = kind or ("closed-form" if name == "pp-cbf" else "qp")  # the PP-CBF knows nothing of a torque box
+        return problem.barrier(name), FilterConfig(kind=kind, metric=metric or "kinetic", solver=solver, dt=dt)
+    if not Path(name).is_dir():
+        raise InputError(f"--barrier: '{name}' is neither a barrier folder nor one of lb-cbf, pp-cbf, none")
+    stored = load_barrier(Path(name))
+    trained = stored.filter
+    config = FilterConfig(kind=kind or trained["kind"], metric=metric or trained["metric"], alpha=trained["alpha"],
+                          solver=solver, dt=dt)  # fmt: skip
+    return stored.barrier(problem), config
+
+
+def run(
+    problem: Problem,
+    barrier: Barrier | None,
+    config: FilterConfig,
+    q: Array,
+    v: Array,
+    duration: float,
+    meta: dict[str, Any],
+) -> Trajectory:
+    """A rollout with a progress bar; meta names robot, world, barrier and filter."""
+    runtime = None
+    if barrier is not None:
+        runtime = SafetyFilter(problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd)
+    described = {
+        "robot": _portable(problem.robot.name),
+        "obstacles": _portable(problem.world_name),
+        "barrier_kind": barrier.kind if barrier else "none",
+        "filter": config.kind if barrier else "none",
+        "metric": config.metric if barrier else "none",
+        **meta,
+    }
+    ticks = iter(track(range(max(1, round(duration / config.dt) // 50)), "simulating", console=err, transient=True))
+    trajectory = rollout(
+        problem.safety, problem.robot.controller, runtime, q, v, duration, config.dt, described,
+        on_step=lambda t: next(ticks, None),
+    )  # fmt: skip
+    for _ in ticks:
+        pass
+    return trajectory
+
+
+def _portable(name: str) -> str:
+    """Paths are stored absolute, so that the trajectory can be viewed from any folder."""
+    return str(Path(name).resolve()) if Path(name).is_file() else name
+
+
+def _angles(problem: Problem, text: str | None, what: str, default: Array) -> Array:
+    values = parse_vector(text, what)
+    return default if values is None else problem.model.parse_angles(values, what)
+
+
+def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> None:
+    meta = trajectory.meta
+    out.print(f"{problem.robot.name} in {problem.world_name}: {meta['barrier_kind']}, {meta['filter']}, {meta['metric']}")
+    out.print(f"least h            {facts['min_h']:.4f}  (obstacles alone {facts['clearance']:.4f} m)")
+    out.print(f"largest torque     {facts['max_torque_ratio']:.3f} of its limit")
+    out.print(f"energy             rises by {facts['energy_rise']:.2g} of V0, {facts['injected']:.3g} J injected in all")
+    out.print(f"goal reached       {yes(facts['reached_goal'])}  (largest joint error {number(facts['goal_error'])})")
+    if facts["rests_on"]:
+        out.print(f"rests on           {facts['rests_on']}: a passive filter cannot climb over it")
+    out.print("filter             " + ", ".join(f"{k} {n}" for k, n in facts["filter_counts"].items()))
+    out.print(f"wrote {facts['out']}; look at it with: ppcbf view {facts['out']}")

@@ -1,0 +1,160 @@
+"""``ppcbf train``: train a barrier for a robot and a world."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from ppcbf_robots.artefact import save_barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
+from ppcbf_robots.errors import CheckFailed, InputError
+from ppcbf_robots.problem import Problem, load_problem
+
+if TYPE_CHECKING:
+    from ppcbf_robots.learning.train import Monitor, Result
+
+Kind = Literal["pp-ncbf", "ncbf"]
+PresetChoice = Literal["default", "paper"]
+Device = Literal["auto", "cpu", "cuda"]
+
+
+def train(
+    robot: RobotArgument,
+    obstacles: WorldArgument,
+    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the barrier.")],
+    barrier: Annotated[Kind, typer.Option(help="PP-NCBF (limits and passivity) or NCBF (limits).")] = "pp-ncbf",
+    preset: Annotated[PresetChoice, typer.Option(help="Recommended settings, or the paper's.")] = "default",
+    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
+    gamma: Annotated[float | None, typer.Option(help="gamma of phi = dh/dt + gamma h - K [1/s].")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
+    time_limit: Annotated[float, typer.Option(min=1.0, help="Stop training after so many seconds.")] = 3600.0,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in DIR.")] = False,
+    tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Train a barrier and write it to a folder. Ctrl-C keeps the best barrier so far.
+
+    Exits with 3, after writing, if the barrier did not converge or collapsed.
+
+    Example: ppcbf train two_link circle --out runs/two_link
+    """
+    problem = load_problem(robot, obstacles)
+    if gamma is not None:
+        if not gamma > 0.0:
+            raise InputError(f"--gamma must be positive, got {gamma}")
+        problem = problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": gamma}))
+    if out_dir.exists() and not out_dir.is_dir():
+        raise InputError(f"--out: {out_dir} is a file; give a folder")
+    report = train_barrier(problem, barrier, preset, seed, out_dir, device, iterations, time_limit, resume, tensorboard)
+    if json:
+        emit_json(report)
+    else:
+        _print(report)
+    if not report["converged"]:
+        raise CheckFailed(f"not converged: {report['reason']}; the best barrier so far is in {out_dir}")
+
+
+def train_barrier(
+    problem: Problem,
+    kind: Kind,
+    preset_name: PresetChoice,
+    seed: int,
+    folder: Path,
+    device: Device = "auto",
+    iterations: int | None = None,
+    time_limit: float = float("inf"),
+    resume: bool = False,
+    tensorboard: Path | None = None,
+) -> dict[str, Any]:
+    """Train with a progress bar, save the barrier, and return the keys of ``ppcbf train --json``."""
+    import torch  # takes seconds: only where it is needed
+
+    from ppcbf_robots.learning.checkpoint import load_checkpoint, save_checkpoint
+    from ppcbf_robots.learning.presets import PRESETS
+    from ppcbf_robots.learning.train import Trainer, settings
+
+    chosen = PRESETS[preset_name]
+    if iterations is not None:
+        chosen = dataclasses.replace(chosen, iterations=iterations)
+    for change in chosen.changes:
+        err.print(f"[dim]changed from the paper: {change}[/]")
+    where = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    if where == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: no CUDA device is available here; use --device cpu")
+    trainer = Trainer(problem, kind, chosen, seed, where)
+    if resume:
+        load_checkpoint(trainer, folder)
+    with _progress(kind, chosen.iterations) as show, _tensorboard(tensorboard) as record:
+
+        def on_check(monitor: Monitor) -> None:
+            show(monitor)
+            record(monitor)
+            save_checkpoint(trainer, folder)
+
+        result = trainer.run(on_check, time_limit, on_refine=lambda text: err.print(f"[yellow]{text}[/]"))
+    report = result.report() | {"preset": preset_name, "seed": seed, "device": where, "kind": kind}
+    details = {**report, "settings": settings(chosen), "history": _history(result)}
+    save_barrier(folder, problem, kind, chosen.network, result.params, trainer.filter_config, details)
+    return {**report, "out": str(folder)}
+
+
+def _history(result: Result) -> list[dict[str, Any]]:
+    keys = ("iteration", "volume_kept", "band_yield", "torque", "passivity", "loss", "start_inside", "seconds")
+    return [{k: getattr(m, k) for k in keys} for m in result.history]
+
+
+@contextlib.contextmanager
+def _progress(kind: Kind, planned: int) -> Iterator[Callable[[Monitor], None]]:
+    """A bar with the monitors: volume kept, band yield, share of band states that violate, start inside."""
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[monitors]}"),
+               TimeElapsedColumn())  # fmt: skip
+    with Progress(*columns, console=err) as progress:
+        task = progress.add_task(kind, total=planned, monitors="")
+
+        def show(m: Monitor) -> None:
+            monitors = (
+                f"{m.iteration}/{m.planned} volume {m.volume_kept:.1%} band {m.band_yield:.0%} "
+                f"torque {m.torque:.2%} passivity {m.passivity:.2%} start {'in' if m.start_inside else 'OUT'}"
+            )
+            progress.update(task, completed=m.iteration, total=m.planned, monitors=monitors)
+
+        yield show
+
+
+@contextlib.contextmanager
+def _tensorboard(folder: Path | None) -> Iterator[Callable[[Monitor], None]]:
+    """Writes the monitors as TensorBoard scalars, if a folder was given."""
+    if folder is None:
+        yield lambda monitor: None
+        return
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise InputError('--tensorboard needs the tensorboard package: pip install "ppcbf-robots[tensorboard]"') from None
+    writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+
+    def record(m: Monitor) -> None:
+        for name in ("volume_kept", "band_yield", "torque", "passivity", "loss"):
+            writer.add_scalar(name, getattr(m, name), m.iteration)  # type: ignore[no-untyped-call]
+
+    try:
+        yield record
+    finally:
+        writer.close()  # type: ignore[no-untyped-call]
+
+
+def _print(report: dict[str, Any]) -> None:
+    state = "converged" if report["converged"] else f"NOT converged: {report['reason']}"
+    out.print(f"{report['kind']} {state} after {report['steps']} steps, {report['seconds']:.0f} s on {report['device']}")
+    out.print(
+        f"volume kept {report['volume_kept']:.1%} of the LB safe set; "
+        f"{report['violations']} violations in {report['samples']} uniform band states"
+    )
+    out.print(f"wrote {report['out']}/barrier.json and {report['out']}/weights.safetensors")

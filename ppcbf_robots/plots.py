@@ -1,0 +1,114 @@
+"""Pictures of runs and safe sets: the paper's figures 2 to 5 and 7 for any robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.problem import Problem
+from ppcbf_robots.rollout import Trajectory
+from ppcbf_robots.specs import Array
+
+GRID = 121  # points per axis of a safe-set slice
+MAX_JOINTS = 8
+
+
+def plot_runs(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> None:
+    """Joint positions, storage, clearance and torques of several runs over time (Fig. 2 and 4 of the paper)."""
+    model = problem.model
+    joints = min(model.nv, MAX_JOINTS)
+    fig, axes = plt.subplots(joints + 1, 2, figsize=(12, 2.3 * (joints + 1)), sharex=True, squeeze=False)
+    for label, run in runs.items():
+        angles = model.to_angles(run.q)
+        for i in range(joints):
+            axes[i, 0].plot(run.t, angles[:, i], label=label)
+            axes[i, 1].plot(run.t, run.u[:, i], label=label)
+        axes[joints, 0].plot(run.t, run.V, label=label)
+        axes[joints, 1].plot(run.t, run.clearance, label=label)
+    for i in range(joints):
+        axes[i, 0].set_ylabel(f"{model.joint_names[i]}\nposition")
+        axes[i, 1].set_ylabel("torque")
+        for side in (-1.0, 1.0):
+            axes[i, 1].axhline(side * model.u_max[i], color="k", lw=0.8, ls="--")
+    axes[joints, 0].set_ylabel("storage V [J]")
+    axes[joints, 1].set_ylabel("clearance [m]")
+    axes[joints, 1].axhline(0.0, color="k", lw=0.8, ls="--")
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+    for ax in axes.flat:
+        ax.grid(alpha=0.3)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="upper center", ncols=min(4, len(labels)), frameon=False)
+    _save(fig, path, top=1.0 - 0.5 / (2.3 * (joints + 1)))
+
+
+def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> None:
+    """Paths of the last body sphere in the (x, z) and (x, y) planes with the obstacles (Fig. 3 of the paper)."""
+    fig, axes = plt.subplots(1, 2, figsize=(12, 5.5))
+    for label, run in runs.items():
+        p = _tip_path(problem, run)
+        for ax, k in zip(axes, (2, 1), strict=True):
+            ax.plot(p[:, 0], p[:, k], label=label)
+    for ax, k, name in zip(axes, (2, 1), "zy", strict=True):
+        for o in problem.world.obstacles:
+            if o.type == "sphere":
+                ax.add_patch(plt.Circle((o.center[0], o.center[k]), o.radius, color="0.7"))
+            elif o.normal[0] != 0.0:
+                ax.axvline(o.offset / o.normal[0], color="0.5", lw=3)
+        ax.set_xlabel("x [m]")
+        ax.set_ylabel(f"{name} [m]")
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.grid(alpha=0.3)
+    axes[0].legend(frameon=False)
+    _save(fig, path)
+
+
+def _tip_path(problem: Problem, run: Trajectory) -> Array:
+    model = problem.model
+    every = max(1, len(run.t) // 400)
+    dyn = model.evaluate_batch(run.q[::every], run.v[::every])
+    return problem.safety.points.kinematics(dyn).p[:, -1]
+
+
+def plot_safe_set(problem: Problem, barriers: Mapping[str, Barrier], velocities: list[Array], path: Path) -> None:
+    """Slices of the safe sets over the first two joints at given velocities (Fig. 5 and 7); other joints at the start."""
+    fig, axes = plt.subplots(1, len(velocities), figsize=(6 * len(velocities), 5), squeeze=False)
+    domain, model = problem.robot.domain, problem.model
+    x, y = (np.linspace(*domain.q[i], GRID) for i in (0, 1))
+    X, Y = np.meshgrid(x, y)
+    angles = np.tile(model.to_angles(problem.robot.start), (X.size, 1))
+    angles[:, 0], angles[:, 1] = X.ravel(), Y.ravel()
+    q = model.from_angles(angles)
+    for ax, v in zip(axes[0], velocities, strict=True):
+        dyn = model.evaluate_batch(q, np.tile(v, (len(q), 1)))
+        safety = problem.safety.evaluate(dyn)
+        ax.contourf(X, Y, safety.h.min(-1).reshape(X.shape), levels=[-1e9, 0.0], colors=["0.8"])
+        for i, (label, barrier) in enumerate(barriers.items()):
+            phi = barrier.rows(dyn, safety).phi.min(-1).reshape(X.shape)
+            ax.contour(X, Y, phi, levels=[0.0], colors=[f"C{i}"])
+            ax.plot([], [], color=f"C{i}", label=label)
+        ax.set_title("safe sets at v = (" + ", ".join(f"{s:g}" for s in v[:4]) + ("...)" if len(v) > 4 else ")"))
+        ax.set_xlabel(model.joint_names[0])
+        ax.set_ylabel(model.joint_names[1])
+        ax.legend(frameon=False)
+    _save(fig, path)
+
+
+def _save(fig: Any, path: Path, top: float = 1.0) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fig.tight_layout(rect=(0, 0, 1, top))
+        fig.savefig(path, dpi=110)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        plt.close(fig)
