@@ -16,13 +16,23 @@ from safetensors.numpy import save as save_tensors
 
 from ppcbf_robots.barriers import Barrier, BarrierKind
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import FilterConfig
+from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.network import NetworkKind, NumpyNetwork, Params
 from ppcbf_robots.problem import Problem
-from ppcbf_robots.specs import BarrierSpec, validate
+from ppcbf_robots.specs import BarrierSpec, Positive, Spec, validate
 
 FORMAT = 1
+KEYS = {"kind": str, "network": str, "formula": dict, "filter": dict, "fingerprint": dict, "weights_sha256": str,
+        "robot": str, "world": str, "joints": list}  # fmt: skip
 PACKAGES = ("ppcbf-robots", "pin", "numpy", "torch", "proxsuite")
+
+
+class TrainedFilter(Spec):
+    """The filter a barrier was trained for."""
+
+    kind: FilterKind
+    metric: Metric
+    alpha: Positive  # [1/s]
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ def save_barrier(
     report: dict[str, Any],
 ) -> None:
     """Write the folder: weights first, then barrier.json by an atomic rename."""
-    weights = save_tensors({k: np.ascontiguousarray(w, dtype=np.float64) for k, w in params.items()})
+    weights = save_tensors({k: np.asarray(w, dtype=np.float64, order="C") for k, w in params.items()})
     robot, model = problem.robot, problem.model
     gains = robot.controller.gains
     data = {
@@ -119,10 +129,11 @@ def load_barrier(folder: Path) -> StoredBarrier:
         raise InputError(f"{path}: cannot be read ({error})") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(f"{path}: not a barrier of format {FORMAT}; train it again with this version")
-    missing = [k for k in ("kind", "network", "formula", "filter", "fingerprint", "weights_sha256", "robot", "world")
-               if k not in data]  # fmt: skip
-    if missing:
-        raise InputError(f"{path}: the key '{missing[0]}' is missing; the file was altered")
+    for key, kind in KEYS.items():
+        if key not in data:
+            raise InputError(f"{path}: the key '{key}' is missing; the file was altered")
+        if not isinstance(data[key], kind):
+            raise InputError(f"{path}: the key '{key}' does not hold a {kind.__name__}; the file was altered")
     if hashlib.sha256(weights).hexdigest() != data["weights_sha256"]:
         raise InputError(f"{folder}/weights.safetensors: altered since training (its SHA-256 differs); train again")
     if data["kind"] not in get_args(BarrierKind) or data["network"] not in get_args(NetworkKind):
@@ -134,22 +145,30 @@ def load_barrier(folder: Path) -> StoredBarrier:
     for name, w in params.items():
         if not np.all(np.isfinite(w)):
             raise InputError(f"{folder}/weights.safetensors: '{name}' holds values that are not finite")
-    network = NumpyNetwork(data["network"], params)
-    _check_shapes(path, data, network)
+    if not _shapes_fit(data["network"], params, len(data["joints"])):
+        joints = len(data["joints"])
+        raise InputError(f"{path}: the weights' shapes do not fit {joints} joints; the files do not belong together")
+    trained = validate(data["filter"], TrainedFilter, f"{path}: filter")
     spec = validate(data["formula"], BarrierSpec, f"{path}: formula")
-    return StoredBarrier(data["kind"], spec, network, data["filter"], data)
+    return StoredBarrier(data["kind"], spec, NumpyNetwork(data["network"], params), trained.model_dump(), data)
 
 
-def _check_shapes(path: Path, data: dict[str, Any], network: NumpyNetwork) -> None:
-    nv = len(data.get("joints", []))
-    nq = network.params["in_shift"].shape[0] - (nv if network.kind == "mlp" else 0) if "in_shift" in network.params else 0
-    try:
-        K, K_q, K_v = network.value_and_grad(np.zeros(nq), np.zeros(nv))
-        shapes = np.shape(K), np.shape(K_q), np.shape(K_v)
-    except (ValueError, KeyError, IndexError):
-        shapes = None
-    if shapes != ((), (nq,), (nv,)):
-        raise InputError(f"{path}: the weights' shapes do not fit {nv} joints; the files do not belong together")
+def _shapes_fit(kind: NetworkKind, params: Params, nv: int) -> bool:
+    """Whether every array is there, and no other, with the shape that the layers before it and nv joints ask for."""
+    inputs = width = np.size(params.get("in_shift", ()))
+    nq = inputs - nv if kind == "mlp" else inputs
+    shapes: dict[str, tuple[int, ...]] = {"in_shift": (inputs,), "in_scale": (inputs,)}
+    for i in range(sum(name.startswith("W") and name[1:].isdigit() for name in params)):
+        units = np.size(params.get(f"b{i}", ()))
+        shapes |= {f"W{i}": (width, units), f"b{i}": (units,)}
+        width = units
+    units = np.size(params.get("ba", ()))
+    if kind == "mlp":
+        shapes |= {"w_out": (width,), "b_out": (), "zero_at_rest": ()}
+    else:
+        shapes |= {"Wa": (width, units), "Wb": (width, units * nv), "Wc": (width, units)}
+        shapes |= {"ba": (units,), "bb": (units * nv,), "bc": (units,), "v_scale": (nv,)}
+    return nv <= nq <= 2 * nv and {name: w.shape for name, w in params.items()} == shapes
 
 
 def _finite(x: float) -> float | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -232,7 +233,7 @@ def _first_problem(error: ValidationError, kind: type[Spec]) -> str:
     if problem["type"] == "missing":
         return f"the key '{key}' is missing"
     got = problem.get("input")
-    shown = "" if isinstance(got, dict) or got is None else f", got {got!r}"[:80]
+    shown = "" if isinstance(got, dict) or got is None else f", got {reprlib.repr(got)}"[:80]
     message = problem["msg"].removeprefix("Value error, ")
     return f"{key}: {message[0].lower()}{message[1:]}{shown if problem['type'] != 'value_error' else ''}"
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import load_problem, load_robot, parse_vector
 from ppcbf_robots.resources import find_world
+from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import RobotSpec, WorldSpec, load_spec, per_joint, vector
 
 INERTIAL = """<inertial><origin xyz="0.2 0 0" rpy="0 0 0"/><mass value="1"/>
@@ -117,8 +118,9 @@ URDF_MISTAKES = {
                 "a URDF must not contain DOCTYPE or ENTITY declarations; remove them"),
     "two roots": ('<link name="base"/>', '<link name="base"/><link name="loose"/>',
                   "a URDF has one root link, this one has 2 ('base', 'loose')"),
-    "loop": ('<link name="tip"/>', '<link name="tip"/><joint name="back" type="fixed"><parent link="tip"/>'
-             '<child link="upper"/></joint>', "link 'upper' is the child of two joints; closed loops are not supported"),
+    "loop": ('<link name="tip"/>',
+             '<link name="tip"/><joint name="back"><parent link="tip"/><child link="upper"/></joint>',
+             "link 'upper' is the child of two joints; closed loops are not supported"),
     "floating joint": ('type="revolute"', 'type="floating"',
                        "joint 'shoulder' is floating; only fixed-base arms are supported"),
     "planar joint": ('type="revolute"', 'type="planar"',
@@ -331,6 +333,14 @@ def test_files_that_are_no_world(tmp_path, content, expected):
     assert message(load_spec, path, WorldSpec, "obstacle spec").startswith(f"{path}: {expected}")
 
 
+def test_aliases_that_multiply_are_refused_at_once(tmp_path):
+    """Ten lists of ten of ten ...: a kilobyte that nobody may write out."""
+    lists = "\n".join(f"k{i + 1}: &k{i + 1} [{', '.join([f'*k{i}'] * 10)}]" for i in range(12))
+    path = tmp_path / "world.yaml"
+    path.write_text(f"k0: &k0 [x, x]\n{lists}\nobstacles: [*k12]\n")
+    assert message(load_spec, path, WorldSpec, "obstacle spec").startswith(f"{path}: obstacles.0: ")
+
+
 def test_missing_files_and_unknown_names(tmp_path):
     assert message(load_robot, "nope.yaml") == "robot file not found: nope.yaml"
     assert message(load_robot, "nope.urdf") == "robot file not found: nope.urdf"
@@ -422,10 +432,15 @@ def test_fuzzed_robot_specs(files, content):
 
 @FUZZ
 @given(content=st.binary(max_size=200) | mutations(WORLD))
-def test_fuzzed_worlds(files, content):
-    folder = files()
-    (folder / "world.yaml").write_bytes(content)
-    accepts_or_refuses(load_problem, str(folder / "arm.yaml"), str(folder / "world.yaml"))
+def test_fuzzed_worlds(two_link, tmp_path, content):
+    path = tmp_path / "world.yaml"
+    path.write_bytes(content)
+
+    def build():
+        obstacles = load_spec(path, WorldSpec, "obstacle spec").obstacles
+        SafetyFunction(two_link.model, two_link.robot.body, obstacles).least(two_link.robot.start)
+
+    accepts_or_refuses(build)
 
 
 @FUZZ

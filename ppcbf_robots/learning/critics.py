@@ -14,6 +14,7 @@ from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.filters import Metric
 
 _TINY = 1e-9
+PASSIVITY_RESERVE = 0.01  # of |v| |u_sc|; more of it fights the torque critic
 DESCENTS = 25  # mirror descent steps towards the worst combination of rows
 DESCENT_RATE = 3.0
 
@@ -36,7 +37,7 @@ def closed_form_critics(
 ) -> tuple[Any, Any]:
     """Torque critic (18) relative to u_max and passivity critic (17) relative to |v| |u_sc|, (B,) each.
 
-    Both ask for ``margin`` in reserve. They are zero where psi(u_des) >= 0, since nothing is corrected there.
+    The torque critic asks for ``margin`` in reserve, the passivity critic for a hundredth of |v| |u_sc|. They are zero where psi(u_des) >= 0, since nothing is corrected there.
     """
     row = least_row(rows)
     psi = row.psi(u_des)[:, 0]
@@ -48,7 +49,8 @@ def closed_form_critics(
     torque = torch.relu(u.abs() / u_max - (1.0 - margin)).amax(-1) * acts
     power = (v * u_sc).sum(-1) - d_p
     size = v.norm(dim=-1) * u_sc.norm(dim=-1)
-    passivity = torch.relu(power + margin * size) / p_ref * acts
+    reserve = PASSIVITY_RESERVE if margin else 0.0
+    passivity = torch.relu(power + reserve * size) / p_ref * acts
     return torque, passivity
 
 

@@ -21,7 +21,7 @@ from ppcbf_robots.specs import Array
 
 RayArrays = dict[str, Array]
 CHUNK = 2000  # configurations evaluated at once, to bound memory
-BISECTIONS = 12
+BISECTIONS = 6  # before the last step, which is a secant
 FAR = 5.0  # [m/s], rho above which a row cannot matter
 
 
@@ -97,16 +97,20 @@ class Field:
         hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
         K = value_along(torch, self.kind, params, rays.q, rays.d)
 
-        def above(s: torch.Tensor) -> torch.Tensor:
-            return (s[:, None] * hdot + self.gamma * rays.h).amin(-1) - K(s) >= level
+        def excess(s: torch.Tensor) -> torch.Tensor:
+            return (s[:, None] * hdot + self.gamma * rays.h).amin(-1) - K(s) - level
 
         low, high = torch.zeros_like(level), torch.ones_like(level)
-        crosses = above(low) & ~above(high)
+        at_low, at_high = excess(low), excess(high)
+        crosses = (at_low >= 0.0) & (at_high < 0.0)
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            ok = above(middle)
-            low, high = torch.where(ok, middle, low), torch.where(ok, high, middle)
-        return low, crosses
+            value = excess(middle)
+            ok = value >= 0.0
+            low, at_low = torch.where(ok, middle, low), torch.where(ok, value, at_low)
+            high, at_high = torch.where(ok, high, middle), torch.where(ok, at_high, value)
+        secant = low + (high - low) * at_low / (at_low - at_high).clamp(min=1e-9)
+        return torch.where(crosses, secant, low), crosses
 
 
 def build_pool(

@@ -1,0 +1,204 @@
+"""The runtime filter: nothing bad that comes in (states, torques, solvers, weights) leads to a bad torque, the filter
+recovers, and its conventions are what its documentation says."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.qp import make_solver
+from ppcbf_robots.safety_filter import SafetyFilter
+
+ALARMS = (Status.FAULT, Status.INVALID, Status.STOP)
+
+BAD_ANSWERS = {
+    "nothing": lambda p: None,
+    "nan": lambda p: np.full(len(p.g), np.nan),
+    "infinite": lambda p: np.full(len(p.g), -np.inf),
+    "zero": lambda p: np.zeros(len(p.g)),
+    "huge": lambda p: np.full(len(p.g), 1e30),
+    "wrong side": lambda p: -1e3 * p.C[0],
+    "wrong length": lambda p: np.zeros(len(p.g) + 2),
+    "scalar": lambda p: np.array(0.0),
+}
+
+
+@pytest.mark.parametrize("answer", BAD_ANSWERS)
+@pytest.mark.parametrize("gravity_included", [True, False])
+def test_a_bad_solver_never_leads_to_a_bad_torque(panda, answer, gravity_included):
+    class Stub:
+        def solve(self, problem):
+            return BAD_ANSWERS[answer](problem)
+
+    model = panda.model
+    filter_ = SafetyFilter(model, panda.safety, panda.barrier("lb-cbf"), gravity_included=gravity_included)
+    filter_.correction.solver = Stub()
+    q, v = panda.robot.start, np.array([2.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    towards = model.gravity(q) + 40.0 * np.eye(7)[0]
+    result = filter_.step(0.0, q, v, towards, 0.0)
+    assert result.status in (Status.FAULT, Status.INFEASIBLE)
+    total = result.u if gravity_included else result.u + model.gravity(q)
+    assert np.all(np.isfinite(total))
+    assert np.all(np.abs(total) <= model.u_max + 1e-9)
+    if result.status is Status.FAULT:
+        g = model.gravity(q)
+        np.testing.assert_allclose(total, np.clip(g - filter_.damping * v, -model.u_max, model.u_max), atol=1e-9)
+
+
+def test_unknown_solver_names_the_installed_ones():
+    with pytest.raises(InputError) as error:
+        make_solver("nosuch")
+    assert str(error.value).startswith("QP solver 'nosuch' is not installed (available: ")
+
+
+# ---------------------------------------------------------------------------------------------- bad input
+
+anything = st.floats(allow_nan=True, allow_infinity=True)
+vectors = st.one_of(
+    st.lists(anything, min_size=2, max_size=2),
+    st.lists(st.floats(-5.0, 5.0), min_size=0, max_size=4),
+    st.just([np.nan, 0.0]),
+    st.just([[0.0, 0.0]]),
+    anything,
+)
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value", "ignore:divide by zero")
+@settings(max_examples=300)
+@given(t=anything, q=vectors, v=vectors, u_des=vectors, d_p=st.none() | anything, included=st.booleans())
+@pytest.mark.parametrize("robot", ["cartpole", "two_link"])
+def test_whatever_comes_in_a_finite_torque_in_the_box_comes_out(problems, robot, t, q, v, u_des, d_p, included):
+    problem = problems[robot]
+    model = problem.model
+    filter_ = SafetyFilter(model, problem.safety, problem.barrier("lb-cbf"), gravity_included=included)
+    start, rest = problem.robot.start, np.zeros(2)
+    first = filter_.step(0.0, start, rest, model.gravity(start) * included, 0.0)
+    assert first.status is Status.FREE
+    result = filter_.step(t, q, v, u_des, d_p)
+    state = [np.asarray(x, float) for x in (q, v)]
+    valid = np.isfinite(t) and t >= 0.0 and all(x.shape == (2,) and np.all(np.isfinite(x)) for x in state)
+    assert np.all(np.isfinite(result.u))
+    assert result.u.shape == (2,)
+    offset = model.evaluate(*state).g if valid and not included else 0.0
+    assert np.all(np.abs(result.u + offset) <= model.u_max * (1 + 1e-12) + 1e-12)
+    if not valid:
+        assert result.status in (Status.INVALID, Status.STOP)
+        assert filter_.step(0.0, start, rest, model.gravity(start) * included, 0.0).status is Status.FREE  # recovered
+    usable = np.shape(u_des) == (2,) and np.all(np.isfinite(u_des)) and (d_p is None or np.isfinite(d_p))
+    if valid and not usable:
+        assert result.status is Status.FAULT
+    assert result.status in ALARMS or (valid and usable)
+
+
+@pytest.mark.parametrize(
+    ("t", "q", "reason"),
+    [
+        (0.01, [np.nan, 0.0], "state not finite"),
+        (0.01, [0.3], "state of shape (1,), (2,) instead of (2,), (2,)"),
+        (-1.0, [0.3, 0.4], "time went backwards, from 0 s to -1 s"),
+        (np.nan, [0.3, 0.4], "state not finite"),
+    ],
+)
+def test_invalid_states_are_bridged_with_gravity_then_stop(two_link, t, q, reason):
+    model = two_link.model
+    filter_ = SafetyFilter(model, two_link.safety, two_link.barrier("lb-cbf"))
+    start, g = two_link.robot.start, model.gravity(two_link.robot.start)
+    filter_.step(0.0, start, np.zeros(2), g, 0.0)
+    bridged = filter_.step(t, q, np.zeros(2), g, 0.0)
+    if t == 0.01:
+        assert (bridged.status, bridged.reason) == (Status.INVALID, reason)
+        np.testing.assert_allclose(bridged.u, g)
+    else:  # an unusable clock cannot bound the bridge
+        assert (bridged.status, bridged.reason) == (Status.STOP, f"{reason}: engage the brakes")
+        np.testing.assert_array_equal(bridged.u, 0.0)
+    assert filter_.step(0.0201, [np.nan, 0.0], np.zeros(2), g, 0.0).status is Status.STOP
+    assert filter_.step(0.03, start, np.zeros(2), g, 0.0).status is Status.FREE
+    assert filter_.counts[Status.STOP] == (1 if t == 0.01 else 2)
+
+
+def test_an_invalid_first_state_stops(two_link):
+    filter_ = SafetyFilter(two_link.model, two_link.safety, two_link.barrier("lb-cbf"))
+    result = filter_.step(0.0, [np.nan, 0.0], [0.0, 0.0], [0.0, 0.0])
+    assert result.status is Status.STOP
+    np.testing.assert_array_equal(result.u, 0.0)
+
+
+def test_a_continuous_joint_off_the_unit_circle_is_invalid(kinova):
+    filter_ = SafetyFilter(kinova.model, kinova.safety, kinova.barrier("lb-cbf"))
+    q = kinova.robot.start.copy()
+    q[kinova.model.idx_q[kinova.model.continuous][0]] += 0.1
+    result = filter_.step(0.0, q, np.zeros(6), np.zeros(6))
+    assert result.reason == "a continuous joint's (cos, sin) is not of length 1: engage the brakes"
+
+
+@pytest.mark.parametrize(
+    ("u_des", "d_p"), [([np.nan, 0.0], 0.0), ([0.0], 0.0), ([0.0, 0.0], np.nan), ([0.0, 0.0], np.inf)]
+)
+def test_bad_torques_are_answered_with_damping(two_link, u_des, d_p):
+    model, damping = two_link.model, np.array([3.0, 2.0])
+    filter_ = SafetyFilter(model, two_link.safety, two_link.barrier("lb-cbf"), damping=damping)
+    q, v = two_link.robot.start, np.array([0.5, -0.5])
+    result = filter_.step(0.0, q, v, u_des, d_p)
+    assert result.status is Status.FAULT
+    np.testing.assert_allclose(result.u, model.gravity(q) - damping * v)
+
+
+def test_a_network_that_returns_nan_is_a_fault(panda, make_barrier):
+    barrier = make_barrier(panda, "pp-ncbf-mlp")
+    barrier.network.params["w_out"][0] = np.nan
+    filter_ = SafetyFilter(panda.model, panda.safety, barrier)
+    result = filter_.step(0.0, panda.robot.start, np.full(7, 0.1), np.zeros(7), 0.0)
+    assert result.status is Status.FAULT
+    assert np.all(np.isfinite(result.u))
+
+
+# ---------------------------------------------------------------------------------------------- conventions
+
+
+@pytest.mark.parametrize("kind", ["qp", "closed-form"])
+def test_without_gravity_the_same_torque_less_gravity(panda, states, kind):
+    """libfranka's convention: u_des and the returned torque leave g out."""
+    config = FilterConfig(kind=kind)
+    both = [SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf"), config, gravity_included=x)
+            for x in (True, False)]  # fmt: skip
+    for i, (q, v) in enumerate(states(panda, 60)):
+        dyn = panda.model.evaluate(q, 0.6 * v)
+        nominal = panda.robot.controller.evaluate(dyn)
+        with_g, without = (f.step(float(i), q, 0.6 * v, nominal.u - x, float(nominal.d_p))
+                           for f, x in zip(both, (0.0, dyn.g), strict=True))  # fmt: skip
+        assert with_g.status is without.status
+        np.testing.assert_allclose(without.u, with_g.u - dyn.g, atol=1e-6 * panda.model.u_max.max())
+    assert both[0].counts[Status.CORRECTING] > 5
+
+
+def test_steps_report_h_phi_and_row(two_link):
+    model = two_link.model
+    filter_ = SafetyFilter(model, two_link.safety, two_link.barrier("lb-cbf"), FilterConfig(alpha=10.0))
+    q = np.array([0.3, 0.541])
+    dyn = model.evaluate(q, np.zeros(2))
+    rows = filter_.barrier.rows(dyn, two_link.safety.evaluate(dyn))
+    result = filter_.step(0.0, q, np.zeros(2), dyn.b - 5.0 * rows.Lg_phi[0], 0.0)
+    assert (result.h, result.phi) == (pytest.approx(rows.h.min()), pytest.approx(rows.phi.min()))
+    assert result.status is Status.CORRECTING
+    assert result.row == "tip#0 / circle"
+    assert filter_.counts == {**dict.fromkeys(Status, 0), Status.CORRECTING: 1}
+
+
+def test_alarms_are_logged_once_per_change(two_link, caplog):
+    filter_ = SafetyFilter(two_link.model, two_link.safety, two_link.barrier("lb-cbf"))
+    q, bad = two_link.robot.start, [np.nan, 0.0]
+    with caplog.at_level("WARNING", logger="ppcbf_robots"):
+        for i in range(5):
+            filter_.step(0.001 * i, q, np.zeros(2), bad)
+    assert [r.getMessage() for r in caplog.records] == ["FAULT: u_des, d_p or the barrier is not finite "]
+
+
+def test_config_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        FilterConfig().alpha = 3.0
