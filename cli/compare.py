@@ -8,12 +8,12 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-
-from ppcbf_robots.artefact import load_barrier
-from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, table, yes
 from ppcbf_robots.cli.simulate import choose_barrier, run
 from ppcbf_robots.cli.train import Device, Kind, PresetChoice, train_barrier
+
+from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.evidence import volume_ratio
 from ppcbf_robots.filters import FilterKind, Metric
@@ -81,7 +81,10 @@ def _fits(folder: Path, problem: Problem, preset: str, seed: int) -> bool:
     except InputError:
         return False
     training = stored.data["training"]
-    return stored.spec == problem.robot.spec.barrier and (training.get("preset"), training.get("seed")) == (preset, seed)
+    return stored.spec == problem.robot.spec.barrier and (training.get("preset"), training.get("seed")) == (
+        preset,
+        seed,
+    )
 
 
 def _cases(out_dir: Path) -> list[Case]:
@@ -117,7 +120,11 @@ def _run_all(
 
 
 def _write(
-    problem: Problem, rows: list[dict[str, Any]], runs: dict[str, Trajectory], barriers: dict[str, Barrier], out_dir: Path
+    problem: Problem,
+    rows: list[dict[str, Any]],
+    runs: dict[str, Trajectory],
+    barriers: dict[str, Barrier],
+    out_dir: Path,
 ) -> list[str]:
     from ppcbf_robots import plots  # matplotlib only where it is needed
 
@@ -138,12 +145,12 @@ def _write(
 
 
 def _print(problem: Problem, rows: list[dict[str, Any]], files: list[str]) -> None:
-    columns = ["barrier", "filter", "metric", "volume", "least h", "|u|/u_max", "V rise / V0", "injected [J]", "clear [s]",
-               "goal"]  # fmt: skip
+    columns = ["barrier", "filter", "metric", "volume", "least h", "|u|/u_max", "V rise / V0", "injected J", "clear s",
+               "goal", "rests on"]  # fmt: skip
     cells = [
         [r["label"], r["filter"], r["metric"], "-" if r["volume_kept"] is None else f"{r['volume_kept']:.1%}",
          number(r["min_h"]), number(r["max_torque_ratio"], 3), f"{r['energy_rise']:.1e}", number(r["injected"], 3),
-         number(r["cleared_at"]), "yes" if r["reached_goal"] else (f"rests on {r['rests_on']}" if r["rests_on"] else yes(False))]
+         number(r["cleared_at"]), yes(r["reached_goal"]), r["rests_on"] or ""]
         for r in rows
     ]  # fmt: skip
     table(f"{problem.robot.name} in {problem.world_name}", columns, cells)

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, out, table
+
 from ppcbf_robots.evidence import check_band
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.problem import Problem, Robot, load_problem, load_robot
@@ -44,7 +44,10 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
     outside, joint = u_des_outside(robot, rng)
     warnings = list(model.warnings)
     if outside > 0.0:
-        warnings.append(f"u_des leaves the torque box on {outside:.1%} of X, most at '{joint}': no barrier can help there")
+        warnings.append(
+            f"u_des leaves the torque box on {outside:.1%} of X, most at '{joint}': "
+            "there the filter must change it even without an obstacle, and the closed form exceeds the box"
+        )
     facts: dict[str, Any] = {
         "robot": model.name,
         "urdf": str(model.urdf),
@@ -106,7 +109,7 @@ def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
     ]  # fmt: skip
     table("moving joints", ["joint", "position", "max speed", "max effort", "kp", "kd", "max spring"], rows)
     spheres = [[s["frame"], ", ".join(f"{x:.3f}" for x in s["center"]), f"{s['radius']:.3f}"] for s in facts["body"]]
-    table(f"body: {len(spheres)} spheres [m]", ["frame", "centre", "radius"], spheres)
+    table(f"body: {len(spheres)} spheres, metres", ["frame", "centre", "radius"], spheres)
     out.print("derived, not given: " + (", ".join(facts["derived"]) or "nothing"))
     out.print("start " + " ".join(f"{x:.3f}" for x in facts["start"]))
     out.print("goal  " + " ".join(f"{x:.3f}" for x in facts["goal"]))

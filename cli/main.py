@@ -7,7 +7,6 @@ import os
 import sys
 
 import typer
-
 from ppcbf_robots.cli.compare import compare
 from ppcbf_robots.cli.export import export
 from ppcbf_robots.cli.info import info
@@ -15,6 +14,7 @@ from ppcbf_robots.cli.output import err
 from ppcbf_robots.cli.simulate import simulate
 from ppcbf_robots.cli.train import train
 from ppcbf_robots.cli.view import view
+
 from ppcbf_robots.errors import PPCBFError
 
 app = typer.Typer(

@@ -38,7 +38,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     """A table on stdout."""
     t = Table(title=title, title_justify="left", title_style="bold")
     for i, name in enumerate(columns):
-        t.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
+        t.add_column(name, justify="left" if i == 0 else "right", overflow="fold", no_wrap=i == 0)
     for row in rows:
         t.add_row(*row)
     out.print(t)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
 from rich.progress import track
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
@@ -24,8 +24,12 @@ def simulate(
     robot: RobotArgument,
     obstacles: WorldArgument,
     barrier: Annotated[str, typer.Option(help="Barrier folder, or lb-cbf, pp-cbf, none.")] = "lb-cbf",
-    filter: Annotated[FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")] = None,
-    metric: Annotated[Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")] = None,
+    filter: Annotated[
+        FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")
+    ] = None,
+    metric: Annotated[
+        Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")
+    ] = None,
     solver: Annotated[str, typer.Option(help="proxqp, or a solver installed for qpsolvers.")] = "proxqp",
     start: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
     velocity: Annotated[str | None, typer.Option(metavar="V,...", help="Start velocity.")] = None,
@@ -60,7 +64,12 @@ def simulate(
 
 
 def choose_barrier(
-    problem: Problem, name: str, kind: FilterKind | None, metric: Metric | None, solver: str = "proxqp", dt: float = 1e-3
+    problem: Problem,
+    name: str,
+    kind: FilterKind | None,
+    metric: Metric | None,
+    solver: str = "proxqp",
+    dt: float = 1e-3,
 ) -> tuple[Barrier | None, FilterConfig]:
     """A barrier by name or folder, and the filter settings that go with it unless others are asked for."""
     if name == "none":
@@ -120,10 +129,14 @@ def _angles(problem: Problem, text: str | None, what: str, default: Array) -> Ar
 
 def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> None:
     meta = trajectory.meta
-    out.print(f"{problem.robot.name} in {problem.world_name}: {meta['barrier_kind']}, {meta['filter']}, {meta['metric']}")
+    out.print(
+        f"{problem.robot.name} in {problem.world_name}: {meta['barrier_kind']}, {meta['filter']}, {meta['metric']}"
+    )
     out.print(f"least h            {facts['min_h']:.4f}  (obstacles alone {facts['clearance']:.4f} m)")
     out.print(f"largest torque     {facts['max_torque_ratio']:.3f} of its limit")
-    out.print(f"energy             rises by {facts['energy_rise']:.2g} of V0, {facts['injected']:.3g} J injected in all")
+    out.print(
+        f"energy             rises by {facts['energy_rise']:.2g} of V0, {facts['injected']:.3g} J injected in all"
+    )
     out.print(f"goal reached       {yes(facts['reached_goal'])}  (largest joint error {number(facts['goal_error'])})")
     if facts["rests_on"]:
         out.print(f"rests on           {facts['rests_on']}: a passive filter cannot climb over it")

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ppcbf_robots.artefact import save_barrier
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem
 
@@ -137,7 +137,9 @@ def _tensorboard(folder: Path | None) -> Iterator[Callable[[Monitor], None]]:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise InputError('--tensorboard needs the tensorboard package: pip install "ppcbf-robots[tensorboard]"') from None
+        raise InputError(
+            '--tensorboard needs the tensorboard package: pip install "ppcbf-robots[tensorboard]"'
+        ) from None
     writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
 
     def record(m: Monitor) -> None:
@@ -152,7 +154,9 @@ def _tensorboard(folder: Path | None) -> Iterator[Callable[[Monitor], None]]:
 
 def _print(report: dict[str, Any]) -> None:
     state = "converged" if report["converged"] else f"NOT converged: {report['reason']}"
-    out.print(f"{report['kind']} {state} after {report['steps']} steps, {report['seconds']:.0f} s on {report['device']}")
+    out.print(
+        f"{report['kind']} {state} after {report['steps']} steps, {report['seconds']:.0f} s on {report['device']}"
+    )
     out.print(
         f"volume kept {report['volume_kept']:.1%} of the LB safe set; "
         f"{report['violations']} violations in {report['samples']} uniform band states"

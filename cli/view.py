@@ -6,17 +6,21 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
 from ppcbf_robots.cli.output import JsonOption, emit_json, err, out
+
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.rollout import Trajectory
 
 
 def view(
-    trajectories: Annotated[list[Path], typer.Argument(metavar="T.npz...", help="Trajectories of one robot and world.")],
+    trajectories: Annotated[
+        list[Path], typer.Argument(metavar="T.npz...", help="Trajectories of one robot and world.")
+    ],
     html: Annotated[Path | None, typer.Option(metavar="F", help="Write one self-contained HTML file instead.")] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Loopback port of the live page; 0 takes a free one.")] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Loopback port of the live page; 0 takes a free one.")
+    ] = 0,
     open_browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the browser.")] = True,
     json: JsonOption = False,
 ) -> None:

@@ -55,7 +55,7 @@ class NominalController:
         return NominalController(self.robot, self.gains, goal)
 
     def spring(self, q: Array, goal_angles: Array | None = None) -> tuple[Array, Array]:
-        """Restoring force (..., nv) and its potential (...) [J], towards the goal or other ``goal_angles`` (..., nv)."""
+        """Restoring force (..., nv) and its potential (...) [J], towards the goal or ``goal_angles`` (..., nv)."""
         e = self.robot.to_angles(q) - (self._goal_angles if goal_angles is None else goal_angles)
         kp, f_max = self.gains.kp, self.gains.max_spring
         if self.gains.kind == "bounded_spring":

@@ -156,19 +156,19 @@ def _collision_vertices(robot: RobotModel) -> dict[int, Array]:
     found: dict[int, list[Array]] = {}
     for shape in geometry.geometryObjects:
         points = _shape_vertices(shape)
-        if points is not None:
-            placed = points @ shape.placement.rotation.T + shape.placement.translation
-            found.setdefault(int(shape.parentJoint), []).append(placed)
+        placed = points @ shape.placement.rotation.T + shape.placement.translation
+        found.setdefault(int(shape.parentJoint), []).append(placed)
     return {joint: np.concatenate(parts) for joint, parts in found.items()}
 
 
-def _shape_vertices(shape: pin.GeometryObject) -> Array | None:
+def _shape_vertices(shape: pin.GeometryObject) -> Array:
     if hasattr(shape.geometry, "vertices") and callable(shape.geometry.vertices):
         return np.asarray(shape.geometry.vertices())  # already scaled by meshScale
     shape.geometry.computeLocalAABB()
     box = shape.geometry.aabb_local
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    return np.asarray(box.min_) + corners * (np.asarray(box.max_) - np.asarray(box.min_))
+    low: Array = np.asarray(box.min_)
+    return low + corners * (np.asarray(box.max_) - low)
 
 
 def _without_still_ones(robot: RobotModel, spheres: list[BodySphere]) -> list[BodySphere]:

@@ -1,8 +1,8 @@
 """Torque corrections: the paper's closed form (8)/(13), and the QP with all its rows.
 
-``u = u_des + δ``. The metric W decides how δ is measured: ``torque`` is the paper's W = I; ``kinetic`` is W = M⁻¹ (Gauss'
-principle of least constraint), whose correction ``δ = Σ λ_k w_k`` acts like contact forces and takes energy out wherever
-K_theta is convex in v.
+``u = u_des + δ``. The metric W decides how δ is measured: ``torque`` is the paper's W = I; ``kinetic`` is W = M⁻¹
+(Gauss' principle of least constraint), whose correction ``δ = Σ λ_k w_k`` acts like contact forces and takes energy out
+wherever K_theta is convex in v.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from enum import IntEnum
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
@@ -101,7 +102,7 @@ class ClosedForm:
         return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
 
     def _damp(self, dyn: Dynamics, k: int, u_des: Array) -> Correction:
-        """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one control period.
+        """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one period.
 
         L_g phi = -vᵀ vanishes at rest, where the explicit λ divides by |v|² and chatters (30 N m from tick to tick on
         the 2R). Here λ is the least one for which the condition holds at the velocity v⁺ the period ends with,
@@ -205,7 +206,14 @@ class QPFilter:
         return np.asarray(H * (n / np.trace(H)))
 
     def _solve(
-        self, dyn: Dynamics, C: Array, lower: Array, binding: Array, passivity: Row | None, box: Box, u_max: Array
+        self,
+        dyn: Dynamics,
+        C: Array,
+        lower: Array,
+        binding: NDArray[np.bool_],
+        passivity: Row | None,
+        box: Box,
+        u_max: Array,
     ) -> Array | None:
         """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
         H = self._hessian(dyn, u_max)

@@ -1,7 +1,7 @@
 """The learned term K_theta(q, v) >= 0 with its exact gradient, in one implementation for numpy and torch.
 
 Every function takes the array module as ``xp`` (numpy at run time, torch in training and export), so the runtime needs
-no torch and cannot drift from what was trained. q stands for Pinocchio's coordinates (cos and sin of continuous joints).
+no torch and cannot drift from what was trained. q stands for Pinocchio's coordinates (cos, sin of continuous joints).
 
 Two forms:
 

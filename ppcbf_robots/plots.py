@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 
 matplotlib.use("Agg")
+import matplotlib.patches as patches
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -61,7 +62,7 @@ def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> 
     for ax, k, name in zip(axes, (2, 1), "zy", strict=True):
         for o in problem.world.obstacles:
             if o.type == "sphere":
-                ax.add_patch(plt.Circle((o.center[0], o.center[k]), o.radius, color="0.7"))
+                ax.add_patch(patches.Circle((o.center[0], o.center[k]), o.radius, color="0.7"))
             elif o.normal[0] != 0.0:
                 ax.axvline(o.offset / o.normal[0], color="0.5", lw=3)
         ax.set_xlabel("x [m]")
@@ -80,10 +81,10 @@ def _tip_path(problem: Problem, run: Trajectory) -> Array:
 
 
 def plot_safe_set(problem: Problem, barriers: Mapping[str, Barrier], velocities: list[Array], path: Path) -> None:
-    """Slices of the safe sets over the first two joints at given velocities (Fig. 5 and 7); other joints at the start."""
+    """Slices of safe sets over the first two joints at given velocities (Fig. 5, 7); other joints at the start."""
     fig, axes = plt.subplots(1, len(velocities), figsize=(6 * len(velocities), 5), squeeze=False)
     domain, model = problem.robot.domain, problem.model
-    x, y = (np.linspace(*domain.q[i], GRID) for i in (0, 1))
+    x, y = (np.linspace(domain.q[i, 0], domain.q[i, 1], GRID) for i in (0, 1))
     X, Y = np.meshgrid(x, y)
     angles = np.tile(model.to_angles(problem.robot.start), (X.size, 1))
     angles[:, 0], angles[:, 1] = X.ravel(), Y.ravel()

@@ -56,7 +56,9 @@ class Problem:
         """The robot's model."""
         return self.robot.model
 
-    def barrier(self, kind: BarrierKind, network: NumpyNetwork | None = None, spec: BarrierSpec | None = None) -> Barrier:
+    def barrier(
+        self, kind: BarrierKind, network: NumpyNetwork | None = None, spec: BarrierSpec | None = None
+    ) -> Barrier:
         """A barrier of one of the four kinds with the robot's constants, or with those of ``spec``."""
         spec = spec or self.robot.spec.barrier
         return EnergyBarrier(spec) if kind == "pp-cbf" else RhoBarrier(kind, self.model, spec, network)
@@ -76,7 +78,7 @@ class Problem:
         h, row = self.safety.least(q)
         if h < 0.0:
             raise InputError(
-                f"the start configuration violates '{row}' by {-h:.4f}: give another with --start, or `start` in the spec"
+                f"the start configuration violates '{row}' by {-h:.4f}: give another with --start or in the spec"
             )
 
     def fingerprint(self) -> dict[str, str]:
@@ -91,8 +93,10 @@ class Problem:
             "body": [s.model_dump() for s in self.robot.body],
         }
         world = [o.model_dump() for o in self.world.obstacles]
-        digest = {k: hashlib.sha256(json.dumps(x, sort_keys=True).encode()).hexdigest()
-                  for k, x in (("robot", robot), ("world", world))}
+        digest = {
+            k: hashlib.sha256(json.dumps(x, sort_keys=True).encode()).hexdigest()
+            for k, x in (("robot", robot), ("world", world))
+        }
         return {"urdf": m.urdf_sha256, **digest}
 
 

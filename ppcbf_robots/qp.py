@@ -1,7 +1,7 @@
 """The filter's quadratic program, apart from who solves it.
 
-``min ½ zᵀ H z + gᵀ z  s.t.  C z >= lower,  box_low <= z <= box_high`` in the dimensionless correction z = δ / u_max, with rows
-of C of length 1. Solvers return ``None`` unless they claim an optimum; the filter checks the claim itself.
+``min ½ zᵀ H z + gᵀ z  s.t.  C z >= lower,  box_low <= z <= box_high`` in the dimensionless correction z = δ / u_max,
+with rows of C of length 1. Solvers return ``None`` unless they claim an optimum; the filter checks the claim itself.
 """
 
 from __future__ import annotations

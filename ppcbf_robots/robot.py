@@ -19,10 +19,10 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, per_joint, vector
 from ppcbf_robots.urdf import check_urdf
 
-_SKEW = np.zeros((3, 3, 3))  # p @ _SKEW = [p]x, the matrix of p x (.)
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _SKEW[_k, _i, _j], _SKEW[_k, _j, _i] = -1.0, 1.0
-_SKEW = _SKEW.reshape(3, 9)
+# p @ _SKEW is [p]x, the matrix of p x (.), row by row
+_SKEW = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], dtype=np.float64
+)
 
 PD_RELATIVE_FLOOR = 1e-10  # least over largest eigenvalue of M below which M counts as singular
 
@@ -69,7 +69,9 @@ class BodyPoints:
 
     def __init__(self, robot: RobotModel, joints: Sequence[int], offsets: Array) -> None:
         self.joints = np.asarray(joints, dtype=int)
-        self.offsets = np.concatenate([np.asarray(offsets, float).reshape(-1, 3), np.ones((len(self.joints), 1))], axis=1)
+        self.offsets = np.concatenate(
+            [np.asarray(offsets, float).reshape(-1, 3), np.ones((len(self.joints), 1))], axis=1
+        )
         self.mask = robot.ancestors[self.joints]  # (points, nv): which joints move which point
 
     def __len__(self) -> int:
@@ -148,7 +150,9 @@ class RobotModel:
         names = list(self.full_model.names)[1:]
         for joint in locked:
             if joint not in names:
-                raise InputError(f"{self.urdf}: locked joint '{joint}' is not a moving joint (moving: {', '.join(names)})")
+                raise InputError(
+                    f"{self.urdf}: locked joint '{joint}' is not a moving joint (moving: {', '.join(names)})"
+                )
         for joint in mimics:
             if joint in names and joint not in locked:
                 locked[joint] = 0.0
@@ -319,10 +323,13 @@ class RobotModel:
         for q in self.from_angles(angles):
             M = np.triu(pin.crba(self.model, self.data, q))
             M = M + np.triu(M, 1).T
-            values, vectors = np.linalg.eigh(M) if np.all(np.isfinite(M)) else (np.array([np.nan]), np.ones((self.nv, 1)))
+            values, vectors = (
+                np.linalg.eigh(M) if np.all(np.isfinite(M)) else (np.array([np.nan]), np.ones((self.nv, 1)))
+            )
             if not values[0] > PD_RELATIVE_FLOOR * max(values[-1], 1e-6):
                 joint = self.joint_names[int(np.argmax(np.abs(vectors[:, 0])))]
                 raise InputError(
-                    f"{self.urdf}: the mass matrix is not positive definite (least eigenvalue {values[0]:.3g}): the link "
-                    f"moved by joint '{joint}' has no mass or inertia; give it one in the URDF, or lock the joint"
+                    f"{self.urdf}: the mass matrix is not positive definite (least eigenvalue {values[0]:.3g}): "
+                    f"the link moved by joint '{joint}' has no mass or inertia; give it one in the URDF, "
+                    "or lock the joint"
                 )

@@ -89,7 +89,6 @@ class Trajectory:
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
 
-
     def _cleared_at(self) -> float | None:
         """Time [s] after which the clearance stays above 5 cm; None if it never fell below, or never rose again."""
         near = np.flatnonzero(self.clearance <= NEAR)
@@ -143,11 +142,12 @@ def simulate(
             q, v = _rk4(model, q, v, last.u, RK4_STEP)
         if on_step is not None and i % 50 == 0:
             on_step(t)
-    fields = [np.array(x) for x in zip(*record, strict=True)]
-    moving = np.abs(fields[2][-1]) > 0.02 * model.v_max
+    names = [f for f in Trajectory.__dataclass_fields__ if f != "meta"]
+    fields: dict[str, Any] = {k: np.array(x) for k, x in zip(names, zip(*record, strict=True), strict=True)}
+    moving = np.abs(fields["v"][-1]) > 0.02 * model.v_max
     rests = last.row if last.status not in (Status.FREE, Status.STOP) and not np.any(moving) else ""
     extra = {"goal": controller.goal.tolist(), "rests_on": rests or None, "complete": len(record) == steps + 1}
-    return Trajectory(*fields, meta={**(meta or {}), **extra})
+    return Trajectory(**fields, meta={**(meta or {}), **extra})
 
 
 def _rk4(model: RobotModel, q: Array, v: Array, u: Array, dt: float) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
-"""Safety functions h_k(q): signed distances of body spheres to obstacles, and joint limits, with exact second order terms.
+"""Safety functions h_k(q): signed distances of body spheres to obstacles, and joint limits, to second order.
 
-One row k per pair of body sphere and obstacle, and one per finite joint limit; safe is ``h_k >= 0`` for all k. A world is
-a family of rows, not one smooth minimum, whose curvature would be large and false.
+One row k per pair of body sphere and obstacle, and one per finite joint limit; safe is ``h_k >= 0`` for all k. A world
+is a family of rows, not one smooth minimum, whose curvature would be large and false.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ class SafetyFunction:
         labels = [f"{s.frame}#{i}" for i, s in enumerate(body)]
         self.names = [f"{b} / {o.name}" for kind in (balls, planes) for b in labels for o in kind]
         self.pairs = len(self.names)
-        self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in self._limits]
+        self.names += [
+            f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in self._limits
+        ]
         self.rows = len(self.names)
         self._limit_index = np.array([i for i, _, _ in self._limits], dtype=int)
         self._limit_sign = np.array([s for _, s, _ in self._limits])

@@ -65,9 +65,7 @@ class SafetyFilter:
         self._last_status = Status.FREE
         self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
 
-    def step(
-        self, t: float, q: ArrayLike, v: ArrayLike, u_des: ArrayLike, d_p: float | None = None
-    ) -> StepResult:
+    def step(self, t: float, q: ArrayLike, v: ArrayLike, u_des: ArrayLike, d_p: float | None = None) -> StepResult:
         """One control step.
 
         Args:
@@ -95,7 +93,9 @@ class SafetyFilter:
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
         usable = u_des.shape == (self.robot.nv,) and bool(np.all(np.isfinite(u_des + offset)))
-        usable = usable and (d_p is None or np.isfinite(d_p)) and bool(np.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum()))
+        usable = (
+            usable and (d_p is None or np.isfinite(d_p)) and bool(np.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum()))
+        )
         if not usable:
             u = np.clip(dyn.g - self.damping * dyn.v, -u_max, u_max) - offset
             return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")

@@ -10,7 +10,7 @@ import re
 import reprlib
 from collections.abc import Hashable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import yaml
@@ -153,7 +153,7 @@ class WorldSpec(Spec):
 class _Loader(yaml.SafeLoader):
     """YAML 1.2's idea of numbers and booleans, and no silent overwriting of repeated keys."""
 
-    yaml_implicit_resolvers = {
+    yaml_implicit_resolvers: ClassVar[Any] = {
         first: [(tag, rx) for tag, rx in resolvers if tag not in ("tag:yaml.org,2002:float", "tag:yaml.org,2002:bool")]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
@@ -171,7 +171,9 @@ class _Loader(yaml.SafeLoader):
 
 _FLOAT = re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$")
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
-_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
 
 S = TypeVar("S", bound=Spec)
 MAX_SPEC_BYTES = 4_000_000
@@ -203,7 +205,7 @@ def load_spec(path: Path, kind: type[S], what: str) -> S:
     if len(text) > MAX_SPEC_BYTES:
         raise InputError(f"{path}: larger than {MAX_SPEC_BYTES // 10**6} MB, which no {what} is")
     try:
-        data = yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader with stricter resolvers
+        data = yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "unknown line"
@@ -225,7 +227,11 @@ def validate(data: dict[str, Any], kind: type[S], where: str) -> S:
 
 def _first_problem(error: ValidationError, kind: type[Spec]) -> str:
     problem = error.errors(include_url=False)[0]
-    loc = [str(x) for x in problem["loc"] if str(x) not in ("sphere", "half_space", "float", "list[float]", "dict[str,float]")]
+    loc = [
+        str(x)
+        for x in problem["loc"]
+        if str(x) not in ("sphere", "half_space", "float", "list[float]", "dict[str,float]")
+    ]
     key = ".".join(loc) or "file"
     if problem["type"] == "extra_forbidden":
         known = ", ".join(kind.model_fields) if len(loc) == 1 else "see the README's list of keys"

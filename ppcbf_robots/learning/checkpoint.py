@@ -52,13 +52,15 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
     if not path.is_file():
         raise InputError(f"nothing to resume: {path} does not exist")
     try:
-        with safe_open(path, "pt") as file:  # type: ignore[no-untyped-call]
+        with safe_open(path, "pt") as file:
             state = json.loads(file.metadata()["state"])
-            tensors = {k: file.get_tensor(k) for k in file.keys()}
+            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - not a dict
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a checkpoint ({error}); train from the start without --resume") from None
     if state["identity"] != trainer.identity():
-        raise InputError(f"{path}: belongs to another robot, world, preset, barrier or seed; resume with the same options")
+        raise InputError(
+            f"{path}: belongs to another robot, world, preset, barrier or seed; resume with the same options"
+        )
     for k in trainer.trained:
         with torch.no_grad():
             trainer.params[k].copy_(tensors[f"param/{k}"])

@@ -37,7 +37,8 @@ def closed_form_critics(
 ) -> tuple[Any, Any]:
     """Torque critic (18) relative to u_max and passivity critic (17) relative to |v| |u_sc|, (B,) each.
 
-    The torque critic asks for ``margin`` in reserve, the passivity critic for a hundredth of |v| |u_sc|. They are zero where psi(u_des) >= 0, since nothing is corrected there.
+    The torque critic asks for ``margin`` in reserve, the passivity critic for a hundredth of |v| |u_sc|. They are
+    zero where psi(u_des) >= 0, since nothing is corrected there.
     """
     row = least_row(rows)
     psi = row.psi(u_des)[:, 0]
@@ -59,9 +60,10 @@ def feasibility_margin(
 ) -> tuple[Any, Any]:
     """Margin of all rows together with torque box and passivity row, (B,), and of box with passivity alone, (B,).
 
-    ``max_u min_k (psi_k(u) + alpha phi_k) / authority_k`` over ``|u| <= u_max`` and ``vᵀ(u - u_des) <= d_p``. By duality
-    it is the least margin over all convex combinations of the rows; the combination is found by mirror descent and held
-    fixed for the gradient (envelope theorem), the margin of the combined row is exact.
+    ``max_u min_k (psi_k(u) + alpha phi_k) / authority_k`` over ``|u| <= u_max``, ``vᵀ(u - u_des) <= d_p``. By duality it
+    is the least margin over all convex combinations of the rows. The combination is found by mirror descent and held
+    fixed for the gradient (envelope theorem); the margin of the combined row is exact, so what is returned is an upper
+    bound, exact for one row.
     """
     authority = (rows.Lg_phi.abs() * u_max).sum(-1) + _TINY
     level = rows.phi.detach()  # states are drawn at a level of phi: moving the level is no way to gain margin
@@ -99,8 +101,9 @@ def _worst_combination(offset: Any, c: Any, v: Any, budget: Any, u_max: Any) -> 
     rows = offset.shape[-1]
     if rows == 1:
         return torch.ones_like(offset)
-    single = offset + _largest(c.flatten(0, 1), v.repeat_interleave(rows, 0),
-                               None if budget is None else budget.repeat_interleave(rows, 0), u_max)[0].view_as(offset)  # fmt: skip
+    budgets = None if budget is None else budget.repeat_interleave(rows, 0)
+    alone = _largest(c.flatten(0, 1), v.repeat_interleave(rows, 0), budgets, u_max)[0]
+    single = offset + alone.view_as(offset)
     best, best_share = single.min(-1)
     best_share = torch.nn.functional.one_hot(best_share, rows).to(offset.dtype)
     logits = torch.zeros_like(offset)
@@ -112,6 +115,8 @@ def _worst_combination(offset: Any, c: Any, v: Any, budget: Any, u_max: Any) -> 
         better = margin < best
         best, best_share = torch.where(better, margin, best), torch.where(better[..., None], share, best_share)
         reduced = combined if budget is None else combined - mu[..., None] * v
-        u = torch.tanh(reduced / (0.02 * reduced.abs().amax(-1, keepdim=True) + _TINY)) * u_max  # smoothed best response
+        u = (
+            torch.tanh(reduced / (0.02 * reduced.abs().amax(-1, keepdim=True) + _TINY)) * u_max
+        )  # smoothed best response
         logits = logits - DESCENT_RATE / (1.0 + t) ** 0.5 * (offset + (c * u[..., None, :]).sum(-1))
     return best_share

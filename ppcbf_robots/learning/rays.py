@@ -1,7 +1,7 @@
 """Rays v = s d in velocity space: everything independent of theta, computed once with Pinocchio.
 
-Along a ray ``b = g + s² beta(d)`` and ``vᵀ ∇²h v = s² eta(d)``, so a pool of rays gives unlimited states without another
-call of Pinocchio, and bisection in s lands on any level of phi.
+Along a ray ``b = g + s² beta(d)`` and ``vᵀ ∇²h v = s² eta(d)``, so a pool of rays gives unlimited states without
+another call of Pinocchio, and bisection in s lands on any level of phi.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ class Rays:
 
     def join(self, other: Rays) -> Rays:
         """Both pools as one."""
-        return Rays(**{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in dataclasses.fields(self)})
+        return Rays(
+            **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in dataclasses.fields(self)}
+        )
 
     def select(self, index: torch.Tensor) -> Rays:
         """Some of the rays."""
@@ -98,7 +100,9 @@ class Field:
         K = value_along(torch, self.kind, params, rays.q, rays.d)
 
         def excess(s: torch.Tensor) -> torch.Tensor:
-            return (s[:, None] * hdot + self.gamma * rays.h).amin(-1) - K(s) - level
+            rho: torch.Tensor = (s[:, None] * hdot + self.gamma * rays.h).amin(-1)
+            value: torch.Tensor = K(s)
+            return rho - value - level
 
         low, high = torch.zeros_like(level), torch.ones_like(level)
         at_low, at_high = excess(low), excess(high)

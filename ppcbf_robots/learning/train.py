@@ -14,9 +14,9 @@ import torch
 
 from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.evidence import POWER_TOLERANCE, BandCheck, check_band
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.critics import closed_form_critics, feasibility_margin
-from ppcbf_robots.evidence import POWER_TOLERANCE, BandCheck, check_band
 from ppcbf_robots.learning.parameters import CONSTANTS, Tensors, initial_parameters
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Field, Rays, VolumeStates, build_pool, rays_at, to_tensors
@@ -136,13 +136,17 @@ class Trainer:
         rays, volume = build_pool(self.problem, p.rays, p.rows_per_ray, p.random_goals, self.rng)
         free = sum(len(r["q"]) for r in rays)
         if free < 200:
-            raise InputError("almost every configuration of the domain X is in collision; shrink X or move the obstacles")
+            raise InputError(
+                "almost every configuration of the domain X is in collision; shrink X or move the obstacles"
+            )
         pool = Rays(**to_tensors(rays, self.device, self.dtype))
         return pool.without_far_rows(self.spec.gamma), VolumeStates(**to_tensors(volume, self.device, self.dtype))
 
     def identity(self) -> str:
         """What a checkpoint must share with this run to be resumed."""
-        return json.dumps([self.problem.fingerprint(), self.spec.model_dump(), self.kind, settings(self.preset), self.seed])
+        return json.dumps(
+            [self.problem.fingerprint(), self.spec.model_dump(), self.kind, settings(self.preset), self.seed]
+        )
 
     def run(
         self,
@@ -257,7 +261,8 @@ class Trainer:
         snapshot = self._snapshot()
         monitor = Monitor(
             self.iteration, self.planned, self._volume_kept(), found, torque, passivity,
-            (self.weights[0], self.weights[1]), self.loss, self._start_inside(snapshot), time.monotonic() - self.started,
+            (self.weights[0], self.weights[1]), self.loss, self._start_inside(snapshot),
+            time.monotonic() - self.started,
         )  # fmt: skip
         self.history.append(monitor)
         if monitor.clean:
