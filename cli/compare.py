@@ -38,7 +38,7 @@ def compare(
     out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for table, plots, barriers, runs.")],
     preset: Annotated[PresetChoice, typer.Option(help="Training settings of the two learned barriers.")] = "paper",
     seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
-    duration: Annotated[float, typer.Option(min=0.1, help="[s]")] = 15.0,
+    duration: Annotated[float, typer.Option(min=0.1, help="Simulated seconds of every run.")] = 15.0,
     device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
     iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
     reuse: Annotated[bool, typer.Option(help="Take barriers already in DIR if they fit.")] = True,
@@ -60,7 +60,7 @@ def compare(
     for kind in kinds:
         folder = out_dir / kind
         if reuse and _fits(folder, problem, preset, seed):
-            err.print(f"[dim]{kind}: taken from {folder}[/]")
+            err.print(f"{kind}: taken from {folder}", style="dim", soft_wrap=True)
             continue
         report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
         failed += [] if report["converged"] else [f"{kind}: {report['reason']}"]

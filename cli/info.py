@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.text import Text
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, out, table
 
 from ppcbf_robots.evidence import check_band
@@ -99,7 +100,7 @@ def _limit(x: float) -> float | None:
 
 
 def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
-    out.print(f"[bold]{facts['robot']}[/]  {facts['urdf']}")
+    out.print(Text.assemble((facts["robot"], "bold"), "  ", facts["urdf"]))
     locked = "".join(f", {n} locked at {x:g}" for n, x in facts["locked"].items())
     out.print(f"nq {facts['nq']}, nv {facts['nv']}{locked}; controller {facts['controller']}")
     rows = [

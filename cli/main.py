@@ -7,6 +7,7 @@ import os
 import sys
 
 import typer
+from rich.text import Text
 from ppcbf_robots.cli.compare import compare
 from ppcbf_robots.cli.export import export
 from ppcbf_robots.cli.info import info
@@ -35,7 +36,7 @@ def main() -> None:
     try:
         app()
     except PPCBFError as error:
-        err.print(f"[bold red]error:[/] {_escape(str(error))}", soft_wrap=True)
+        err.print(Text.assemble(("error:", "bold red"), " ", str(error)), soft_wrap=True)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         err.print("stopped")
@@ -43,10 +44,6 @@ def main() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
-
-
-def _escape(text: str) -> str:
-    return text.replace("[", r"\[")
 
 
 if __name__ == "__main__":

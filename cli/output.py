@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-out = Console(highlight=False, soft_wrap=True)
-err = Console(stderr=True, highlight=False)
+out = Console(highlight=False, markup=False, soft_wrap=True)  # no markup: units and paths have brackets
+err = Console(stderr=True, highlight=False, markup=False)
 
 RobotArgument = Annotated[
     str, typer.Argument(metavar="ROBOT", help="Bundled name, robot spec (YAML), URDF path, or example-robot-data name.")
@@ -20,7 +21,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object 
 
 
 def emit_json(data: dict[str, Any]) -> None:
-    """One JSON object on stdout; NaN becomes null, as JSON has none."""
+    """One JSON object on stdout; NaN and infinity become null, as JSON has neither."""
     typer.echo(json.dumps(_plain(data), indent=2))
 
 
@@ -29,7 +30,7 @@ def _plain(x: Any) -> Any:
         return {str(k): _plain(y) for k, y in x.items()}
     if isinstance(x, list | tuple):
         return [_plain(y) for y in x]
-    if isinstance(x, float) and x != x:
+    if isinstance(x, float) and not math.isfinite(x):
         return None
     return x.item() if hasattr(x, "item") else x
 

@@ -34,7 +34,7 @@ def simulate(
     start: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
     velocity: Annotated[str | None, typer.Option(metavar="V,...", help="Start velocity.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
-    duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="[s]")] = 10.0,
+    duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="Simulated seconds.")] = 10.0,
     rate: Annotated[float, typer.Option(min=10.0, max=2000.0, help="Control rate [Hz].")] = 1000.0,
     out_file: Annotated[Path, typer.Option("--out", metavar="T.npz")] = Path("trajectory.npz"),
     json: JsonOption = False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -47,8 +48,8 @@ def train(
     """
     problem = load_problem(robot, obstacles)
     if gamma is not None:
-        if not gamma > 0.0:
-            raise InputError(f"--gamma must be positive, got {gamma}")
+        if not 0.0 < gamma < math.inf:
+            raise InputError(f"--gamma must be positive and finite, got {gamma}")
         problem = problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": gamma}))
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
@@ -84,7 +85,7 @@ def train_barrier(
     if iterations is not None:
         chosen = dataclasses.replace(chosen, iterations=iterations)
     for change in chosen.changes:
-        err.print(f"[dim]changed from the paper: {change}[/]")
+        err.print(f"changed from the paper: {change}", style="dim")
     where = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     if where == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is available here; use --device cpu")
@@ -98,7 +99,7 @@ def train_barrier(
             record(monitor)
             save_checkpoint(trainer, folder)
 
-        result = trainer.run(on_check, time_limit, on_refine=lambda text: err.print(f"[yellow]{text}[/]"))
+        result = trainer.run(on_check, time_limit, on_refine=lambda text: err.print(text, style="yellow"))
     report = result.report() | {"preset": preset_name, "seed": seed, "device": where, "kind": kind}
     details = {**report, "settings": settings(chosen), "history": _history(result)}
     save_barrier(folder, problem, kind, chosen.network, result.params, trainer.filter_config, details)

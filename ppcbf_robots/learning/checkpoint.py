@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.learning.train import Trainer
+from ppcbf_robots.learning.train import Monitor, Trainer
 
 FILE = "checkpoint.safetensors"
 
@@ -26,6 +27,8 @@ def save_checkpoint(trainer: Trainer, folder: Path) -> None:
     for j, (volume, params) in enumerate(trainer.clean):
         tensors |= {f"clean/{j}/{k}": torch.as_tensor(x) for k, x in params.items()}
         tensors[f"clean/{j}/volume"] = torch.tensor(volume)
+    for j, states in enumerate(trainer.counterexamples):
+        tensors |= {f"counterexamples/{j}/{k}": torch.as_tensor(x) for k, x in zip("qv", states, strict=True)}
     state = {
         "identity": trainer.identity(),
         "iteration": trainer.iteration,
@@ -33,6 +36,7 @@ def save_checkpoint(trainer: Trainer, folder: Path) -> None:
         "weights": trainer.weights,
         "margin": trainer.margin,
         "rng": trainer.rng.bit_generator.state,
+        "history": [dataclasses.asdict(monitor) for monitor in trainer.history],
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -73,6 +77,8 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
     trainer.optimizer.load_state_dict(adam)
     trainer.generator.set_state(tensors["generator"])
     trainer.buffer = (tensors["buffer/index"].to(trainer.device), tensors["buffer/s"].to(trainer.device))
+    for j in range(sum(k.startswith("counterexamples/") for k in tensors) // 2):
+        trainer.add_counterexamples(*(tensors[f"counterexamples/{j}/{k}"].numpy() for k in "qv"))
     count = sum(k.endswith("/volume") for k in tensors)
     trainer.clean = [
         (
@@ -85,3 +91,4 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
     trainer.iteration, trainer.planned = state["iteration"], state["planned"]
     trainer.weights, trainer.margin = state["weights"], state["margin"]
     trainer.rng.bit_generator.state = state["rng"]
+    trainer.history = [Monitor(**{**monitor, "weights": tuple(monitor["weights"])}) for monitor in state["history"]]

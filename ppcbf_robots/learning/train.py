@@ -126,6 +126,7 @@ class Trainer:
         self.loss = float("nan")
         self.history: list[Monitor] = []
         self.clean: list[tuple[float, dict[str, Array]]] = []  # (volume kept, parameters), best first
+        self.counterexamples: list[tuple[Array, Array]] = []  # q, v whose rays joined the pool
         self.started = time.monotonic()
 
     def _tensor(self, x: Array) -> torch.Tensor:
@@ -182,7 +183,7 @@ class Trainer:
         """Lines 2 to 12 of Algorithm 1."""
         while self.iteration < self.planned and time.monotonic() - self.started < time_limit:
             self._iterate()
-            if self.iteration % self.preset.check_every == 0:
+            if self.iteration % self.preset.check_every == 0 or self.iteration == self.planned:
                 monitor = self._check()
                 if on_check is not None:
                     on_check(monitor)
@@ -312,10 +313,15 @@ class Trainer:
         self.planned = self.iteration + self.preset.iterations // 2
         if any(t.check.violations for t in tested):
             q, v = (np.concatenate([getattr(t.check, k) for t in tested]) for k in ("bad_q", "bad_v"))
-            rays, _ = rays_at(self.problem, q, v, self.rays.h.shape[1])
-            found = Rays(**to_tensors([rays], self.device, self.dtype))
-            copies = torch.arange(len(found), device=self.device).repeat(COUNTEREXAMPLE_COPIES)
-            self.rays = self.rays.join(found.select(copies))
+            self.add_counterexamples(q, v)
+
+    def add_counterexamples(self, q: Array, v: Array) -> None:
+        """Rays through states (q, v) join the pool, many times over."""
+        rays, _ = rays_at(self.problem, q, v, self.rays.h.shape[1])
+        found = Rays(**to_tensors([rays], self.device, self.dtype))
+        copies = torch.arange(len(found), device=self.device).repeat(COUNTEREXAMPLE_COPIES)
+        self.rays = self.rays.join(found.select(copies))
+        self.counterexamples.append((q, v))
 
     def _result(self, params: dict[str, Array], check: BandCheck, interrupted: bool) -> Result:
         tensors = {k: self._tensor(x) for k, x in params.items()}

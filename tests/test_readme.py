@@ -1,0 +1,64 @@
+"""Every command, Python block and YAML block of the README runs; long commands at reduced size."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ppcbf_robots.cli.main import main
+from ppcbf_robots.specs import RobotSpec, WorldSpec
+
+README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+SMALLER = {
+    "train": ["--iterations", "40"],
+    "simulate": ["--duration", "0.2"],
+    "compare": ["--iterations", "30", "--duration", "0.3"],
+}
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def commands() -> list[list[str]]:
+    """Arguments of every `ppcbf` command, also of those behind `&&`, without comments."""
+    lines = [part.strip() for block in blocks("bash") for line in block.splitlines() for part in line.split("&&")]
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [w[1:] for w in words if w and Path(w[0]).name == "ppcbf"]
+
+
+def test_the_readme_names_every_command() -> None:
+    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare"}
+
+
+@pytest.mark.slow
+def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for arguments in commands():
+        monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(arguments[0], [])])
+        with pytest.raises(SystemExit) as exit_info:
+            main()
+        allowed = {0, 3} if arguments[0] in ("train", "compare") else {0}  # reduced training may not converge
+        assert exit_info.value.code in allowed, arguments
+        for name in ("--out", "--html"):
+            if name in arguments:
+                assert Path(arguments[arguments.index(name) + 1]).exists(), arguments
+    for block in blocks("python"):
+        exec(compile(block, "README.md", "exec"), {})
+
+
+def test_yaml_examples_are_valid() -> None:
+    world, robot = (yaml.safe_load(block) for block in blocks("yaml"))
+    WorldSpec.model_validate(world)
+    assert set(RobotSpec.model_validate(robot).model_fields_set) == set(RobotSpec.model_fields)
+
+
+def test_both_set_up_commands_stand_on_the_first_screen() -> None:
+    first, second = re.findall(r"^python3 -m venv .*$", README, flags=re.MULTILINE)
+    assert "ppcbf view" in first and second.endswith("pytest")
+    assert README[: README.index(second)].count("\n") < 40
