@@ -8,12 +8,12 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, table, yes
-from ppcbf_robots.cli.simulate import choose_barrier, run
-from ppcbf_robots.cli.train import Device, Kind, PresetChoice, train_barrier
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, table, yes
+from ppcbf_robots.cli.simulate import choose_barrier, run
+from ppcbf_robots.cli.train import Device, Kind, PresetChoice, train_barrier
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.evidence import volume_ratio
 from ppcbf_robots.filters import FilterKind, Metric
@@ -21,6 +21,13 @@ from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.rollout import Trajectory
 
 KEYS = ("volume_kept", "min_h", "max_torque_ratio", "energy_rise", "injected", "cleared_at", "reached_goal", "rests_on")
+
+
+LEARNED: dict[str, tuple[Kind, PresetChoice]] = {
+    "ncbf": ("ncbf", "paper"),
+    "pp-ncbf": ("pp-ncbf", "paper"),
+    "pp-ncbf-default": ("pp-ncbf", "default"),
+}
 
 
 class Case(NamedTuple):
@@ -36,7 +43,6 @@ def compare(
     robot: RobotArgument,
     obstacles: WorldArgument,
     out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for table, plots, barriers, runs.")],
-    preset: Annotated[PresetChoice, typer.Option(help="Training settings of the two learned barriers.")] = "paper",
     seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
     duration: Annotated[float, typer.Option(min=0.1, help="Simulated seconds of every run.")] = 15.0,
     device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
@@ -46,8 +52,9 @@ def compare(
 ) -> None:
     """Train NCBF and PP-NCBF, run all four barriers from the same start, write a table and the paper's plots.
 
-    LB-CBF, NCBF, PP-CBF and PP-NCBF run as in the paper (closed form, torque metric); PP-NCBF and LB-CBF also run as
-    the QP in the kinetic metric. Exits with 3 if a training did not converge.
+    LB-CBF, NCBF, PP-CBF and PP-NCBF run as in the paper (paper preset, closed form, torque metric). Beside them stand
+    the PP-CBF in the kinetic metric, and LB-CBF and a PP-NCBF of the default preset as the QP in the kinetic metric.
+    Exits with 3 if a training did not converge.
 
     Example: ppcbf compare cartpole wall --out runs/compare
     """
@@ -55,15 +62,14 @@ def compare(
     problem.check_start(problem.robot.start)
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
-    kinds: tuple[Kind, ...] = ("ncbf", "pp-ncbf")
     failed = []
-    for kind in kinds:
-        folder = out_dir / kind
+    for name, (kind, preset) in LEARNED.items():
+        folder = out_dir / name
         if reuse and _fits(folder, problem, preset, seed):
-            err.print(f"{kind}: taken from {folder}", style="dim", soft_wrap=True)
+            err.print(f"{name}: taken from {folder}", style="dim", soft_wrap=True)
             continue
         report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
-        failed += [] if report["converged"] else [f"{kind}: {report['reason']}"]
+        failed += [] if report["converged"] else [f"{name}: {report['reason']}"]
     rows, runs, barriers = _run_all(problem, out_dir, duration)
     files = _write(problem, rows, runs, barriers, out_dir)
     if json:
@@ -88,7 +94,7 @@ def _fits(folder: Path, problem: Problem, preset: str, seed: int) -> bool:
 
 
 def _cases(out_dir: Path) -> list[Case]:
-    ncbf, pp = str(out_dir / "ncbf"), str(out_dir / "pp-ncbf")
+    ncbf, pp, default = (str(out_dir / name) for name in LEARNED)
     return [
         Case("LB-CBF", "lb-cbf", "closed-form", "torque"),
         Case("NCBF", ncbf, "closed-form", "torque"),
@@ -96,7 +102,7 @@ def _cases(out_dir: Path) -> list[Case]:
         Case("PP-NCBF", pp, "closed-form", "torque"),
         Case("PP-CBF kinetic", "pp-cbf", "closed-form", "kinetic"),
         Case("LB-CBF kinetic QP", "lb-cbf", "qp", "kinetic"),
-        Case("PP-NCBF kinetic QP", pp, "qp", "kinetic"),
+        Case("PP-NCBF kinetic QP", default, "qp", "kinetic"),
     ]
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from ppcbf_robots.cli.output import JsonOption, emit_json, out
 
 from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.cli.output import JsonOption, emit_json, out
 from ppcbf_robots.export import ExportFormat, export_barrier
 
 

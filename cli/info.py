@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.text import Text
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, out, table
 
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, out, table
 from ppcbf_robots.evidence import check_band
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.problem import Problem, Robot, load_problem, load_robot

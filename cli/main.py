@@ -8,6 +8,7 @@ import sys
 
 import typer
 from rich.text import Text
+
 from ppcbf_robots.cli.compare import compare
 from ppcbf_robots.cli.export import export
 from ppcbf_robots.cli.info import info
@@ -15,7 +16,6 @@ from ppcbf_robots.cli.output import err
 from ppcbf_robots.cli.simulate import simulate
 from ppcbf_robots.cli.train import train
 from ppcbf_robots.cli.view import view
-
 from ppcbf_robots.errors import PPCBFError
 
 app = typer.Typer(

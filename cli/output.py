@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-out = Console(highlight=False, markup=False, soft_wrap=True)  # no markup: units and paths have brackets
+_PIPE_WIDTH = 120  # of tables that do not go to a terminal
+_width = None if sys.stdout.isatty() else _PIPE_WIDTH
+out = Console(highlight=False, markup=False, soft_wrap=True, width=_width)  # no markup: units and paths have brackets
 err = Console(stderr=True, highlight=False, markup=False)
 
 RobotArgument = Annotated[

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
 from rich.progress import track
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector

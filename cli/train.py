@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ppcbf_robots.artefact import save_barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from ppcbf_robots.cli.output import JsonOption, emit_json, err, out
 
+from ppcbf_robots.cli.output import JsonOption, emit_json, err, out
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.rollout import Trajectory

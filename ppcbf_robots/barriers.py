@@ -38,7 +38,7 @@ class BarrierRows:
 
     def psi(self, u: Any) -> Any:
         """phi̇ under torque u (..., nv): (..., rows)."""
-        return self.Lf_phi + (self.Lg_phi * u[..., None, :]).sum(-1)
+        return self.Lf_phi + (self.Lg_phi @ u[..., None])[..., 0]
 
 
 def rho_rows(
@@ -48,10 +48,10 @@ def rho_rows(
 
     K (...), K_q_rate (...) = ∂K/∂q · q̇, K_v (..., nv) = ∂K/∂v; b = C v + g.
     """
-    hdot = (grad * v[..., None, :]).sum(-1)
+    hdot = (grad @ v[..., None])[..., 0]
     w = grad - K_v[..., None, :]
     Lg_phi = w @ Minv
-    Lf_phi = curvature + gamma * hdot - K_q_rate[..., None] - (Lg_phi * b[..., None, :]).sum(-1)
+    Lf_phi = curvature + gamma * hdot - K_q_rate[..., None] - (Lg_phi @ b[..., None])[..., 0]
     return BarrierRows(h, hdot + gamma * h - K[..., None], Lf_phi, Lg_phi, w)
 
 

@@ -77,11 +77,10 @@ class ClosedForm:
 
     def _active(self, rows: BarrierRows) -> Array:
         spec = self.barrier.spec
-        if spec.act_within is not None:
-            return np.asarray(rows.h <= spec.act_within)
+        near = np.zeros_like(rows.h, dtype=bool) if spec.act_within is None else rows.h <= spec.act_within
         if self.barrier.kind == "pp-cbf":
-            return np.ones_like(rows.h, dtype=bool)
-        return np.asarray(rows.phi <= spec.epsilon)
+            return np.ones_like(near) if spec.act_within is None else np.asarray(near)
+        return np.asarray(near | (rows.phi <= spec.epsilon))  # a state beyond the band must not pass unfiltered
 
     def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
         """The paper's correction; d_p and u_max do not enter it."""
@@ -156,14 +155,14 @@ class QPFilter:
         if inside and np.all(slack >= 0.0):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
         C = rows.Lg_phi * u_max
-        norms = np.sqrt((C * C).sum(-1))
+        norms = np.sqrt(np.einsum("ij,ij->i", C, C))
         scale = np.maximum(norms, _FLAT)
         C, lower = C / scale[:, None], -slack / scale
         box = (-1.0 - u_des / u_max, 1.0 - u_des / u_max)
-        ends = C * box[0], C * box[1]
-        binding = lower > np.minimum(*ends).sum(-1)  # the others hold for every torque in the box
-        hopeless = lower > np.maximum(*ends).sum(-1) + ROW_TOLERANCE  # no torque in the box satisfies them
-        if np.any(hopeless):
+        center, reach = C @ (-u_des / u_max), np.abs(C).sum(-1)  # C z lies in center ± reach
+        binding = lower > center - reach  # the others hold for every torque in the box
+        hopeless = lower > center + reach + ROW_TOLERANCE  # no torque in the box satisfies them
+        if hopeless.any():
             k = int(np.argmax(np.where(hopeless, lower, -np.inf)))
             flat = norms[k] < _FLAT
             reason = "L_g phi is zero on a violated row" if flat else "a row is out of reach of the torque box"
@@ -200,10 +199,8 @@ class QPFilter:
         return None if norm < 1e-9 else (row / norm, -d_p / norm)
 
     def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
-        n = len(u_max)
-        weight = np.eye(n) if self.config.metric == "torque" else dyn.Minv
-        H = weight * np.outer(u_max, u_max)
-        return np.asarray(H * (n / np.trace(H)))
+        H = np.diag(u_max**2) if self.config.metric == "torque" else dyn.Minv * u_max * u_max[:, None]
+        return np.asarray(H * (len(u_max) / H.trace()))
 
     def _solve(
         self,

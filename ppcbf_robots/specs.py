@@ -83,7 +83,7 @@ class BarrierSpec(Spec):
     alpha_pp: Positive = 100.0  # [J/m], the paper's alpha of the PP-CBF
     gamma_K: Positive = 10.0  # [1/s], of the PP-CBF's zeroing condition
     epsilon: Positive = 0.05  # [m/s], width of the band of eq. (21)
-    act_within: Positive | None = None  # [m]: closed form acts where h <= this instead of phi <= epsilon
+    act_within: Positive | None = None  # [m]: closed form acts where h <= this, too
 
 
 class RobotSpec(Spec):

@@ -14,6 +14,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.qp import make_solver
 from ppcbf_robots.safety_filter import SafetyFilter
+from ppcbf_robots.specs import BarrierSpec
 
 ALARMS = (Status.FAULT, Status.INVALID, Status.STOP)
 
@@ -37,7 +38,7 @@ def test_a_bad_solver_never_leads_to_a_bad_torque(panda, answer, gravity_include
             return BAD_ANSWERS[answer](problem)
 
     model = panda.model
-    filter_ = SafetyFilter(model, panda.safety, panda.barrier("lb-cbf"), gravity_included=gravity_included)
+    filter_ = SafetyFilter(model, panda.safety, panda.barrier("lb-cbf", spec=BarrierSpec()), gravity_included=gravity_included)
     filter_.correction.solver = Stub()
     q, v = panda.robot.start, np.array([2.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     towards = model.gravity(q) + 40.0 * np.eye(7)[0]
@@ -165,7 +166,7 @@ def test_a_network_that_returns_nan_is_a_fault(panda, make_barrier):
 def test_without_gravity_the_same_torque_less_gravity(panda, states, kind):
     """libfranka's convention: u_des and the returned torque leave g out."""
     config = FilterConfig(kind=kind)
-    both = [SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf"), config, gravity_included=x)
+    both = [SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf", spec=BarrierSpec()), config, gravity_included=x)
             for x in (True, False)]  # fmt: skip
     for i, (q, v) in enumerate(states(panda, 60)):
         dyn = panda.model.evaluate(q, 0.6 * v)

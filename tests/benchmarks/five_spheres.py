@@ -13,9 +13,9 @@ import sys
 import time
 
 import numpy as np
-from ppcbf_robots.cli.simulate import choose_barrier
 
 from ppcbf_robots import SafetyFilter, load_problem, simulate
+from ppcbf_robots.cli.simulate import choose_barrier
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
