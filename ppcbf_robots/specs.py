@@ -10,7 +10,7 @@ import re
 import reprlib
 from collections.abc import Hashable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
@@ -153,7 +153,7 @@ class WorldSpec(Spec):
 class _Loader(yaml.SafeLoader):
     """YAML 1.2's idea of numbers and booleans, and no silent overwriting of repeated keys."""
 
-    yaml_implicit_resolvers: ClassVar[Any] = {
+    yaml_implicit_resolvers = {  # noqa: RUF012 - as the base class has it
         first: [(tag, rx) for tag, rx in resolvers if tag not in ("tag:yaml.org,2002:float", "tag:yaml.org,2002:bool")]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }

@@ -120,6 +120,7 @@ def boundary_states(problem, barrier, states, count):
     """(evaluation, row) on phi_k = 0: the speed along a closing direction is found by bisection."""
     model, found = problem.model, 0
     for q, v in states(problem, 20 * count):
+
         def phi(s, q=q, v=v):
             return rows_at(problem, barrier, model.evaluate(q, s * v)).phi
 

@@ -68,12 +68,13 @@ def test_closed_form_brings_psi_to_zero(problem, states, make_barrier, metric):
 
 
 def test_closed_form_acts_only_in_its_band(cartpole, two_link):
-    """phi <= epsilon, also below 0; the 2R's acts by distance instead (paper, §5.2)."""
+    """phi <= epsilon, also below 0; the 2R's acts by distance too (paper, §5.2)."""
     for problem, q, v, acts in (
         (cartpole, [1.4, 0.0], [2.0, 0.0], True),  # phi = -2 + 5 · 0.1 < 0
         (cartpole, [0.5, 0.0], [2.0, 0.0], False),  # phi = -2 + 5 · 1 > 0.05
-        (two_link, [0.3, 0.5], [1.0, 0.0], True),  # h = 0.047
-        (two_link, [0.3, 0.4], [1.0, 0.0], False),  # h = 0.071 > 0.05
+        (two_link, [0.3, 0.5], [0.0, 0.0], True),  # h = 0.047, phi = 0.23
+        (two_link, [0.3, 0.4], [1.0, 0.0], True),  # h = 0.071, phi < 0
+        (two_link, [0.3, 0.4], [0.0, 0.0], False),  # h = 0.071 > 0.05, phi = 0.35
     ):
         barrier = problem.barrier("lb-cbf")
         dyn, rows = rows_at(problem, barrier, np.array(q), np.array(v))

@@ -38,7 +38,8 @@ def test_a_bad_solver_never_leads_to_a_bad_torque(panda, answer, gravity_include
             return BAD_ANSWERS[answer](problem)
 
     model = panda.model
-    filter_ = SafetyFilter(model, panda.safety, panda.barrier("lb-cbf", spec=BarrierSpec()), gravity_included=gravity_included)
+    barrier = panda.barrier("lb-cbf", spec=BarrierSpec())
+    filter_ = SafetyFilter(model, panda.safety, barrier, gravity_included=gravity_included)
     filter_.correction.solver = Stub()
     q, v = panda.robot.start, np.array([2.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     towards = model.gravity(q) + 40.0 * np.eye(7)[0]
@@ -166,8 +167,8 @@ def test_a_network_that_returns_nan_is_a_fault(panda, make_barrier):
 def test_without_gravity_the_same_torque_less_gravity(panda, states, kind):
     """libfranka's convention: u_des and the returned torque leave g out."""
     config = FilterConfig(kind=kind)
-    both = [SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf", spec=BarrierSpec()), config, gravity_included=x)
-            for x in (True, False)]  # fmt: skip
+    barrier = panda.barrier("lb-cbf", spec=BarrierSpec())
+    both = [SafetyFilter(panda.model, panda.safety, barrier, config, gravity_included=x) for x in (True, False)]
     for i, (q, v) in enumerate(states(panda, 60)):
         dyn = panda.model.evaluate(q, 0.6 * v)
         nominal = panda.robot.controller.evaluate(dyn)

@@ -60,8 +60,8 @@ def feasibility_margin(
 ) -> tuple[Any, Any]:
     """Margin of all rows together with torque box and passivity row, (B,), and of box with passivity alone, (B,).
 
-    ``max_u min_k (psi_k(u) + alpha phi_k) / authority_k`` over ``|u| <= u_max``, ``vᵀ(u - u_des) <= d_p``. By duality it
-    is the least margin over all convex combinations of the rows. The combination is found by mirror descent and held
+    ``max_u min_k (psi_k(u) + alpha phi_k) / authority_k`` over ``|u| <= u_max``, ``vᵀ(u - u_des) <= d_p``. By duality
+    it is the least margin over all convex combinations of the rows. The combination is found by mirror descent and held
     fixed for the gradient (envelope theorem); the margin of the combined row is exact, so what is returned is an upper
     bound, exact for one row.
     """
