@@ -52,7 +52,7 @@ PAPER = Preset(
     samples=1000,
     top=200,
     l2=1e-2,
-    iterations=1_400,
+    iterations=2_000,
     changes=(
         "K is zero at rest: K = (f(q, v) - f(q, 0))^2 instead of f(q, v)^2, which lets every resting posture stay safe",
         "critics are dimensionless: torque relative to its limit, power relative to u_max . v_max",
