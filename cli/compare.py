@@ -43,7 +43,7 @@ def compare(
     robot: RobotArgument,
     obstacles: WorldArgument,
     out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for table, plots, barriers, runs.")],
-    seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the training.")] = 0,
     duration: Annotated[float, typer.Option(min=0.1, help="Simulated seconds of every run.")] = 15.0,
     device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
     iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
@@ -65,10 +65,11 @@ def compare(
     failed = []
     for name, (kind, preset) in LEARNED.items():
         folder = out_dir / name
-        if reuse and _fits(folder, problem, preset, seed):
+        report = _earlier(folder, problem, kind, preset, seed, iterations) if reuse else None
+        if report is None:
+            report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
+        else:
             err.print(f"{name}: taken from {folder}", style="dim", soft_wrap=True)
-            continue
-        report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
         failed += [] if report["converged"] else [f"{name}: {report['reason']}"]
     rows, runs, barriers = _run_all(problem, out_dir, duration)
     files = _write(problem, rows, runs, barriers, out_dir)
@@ -80,17 +81,20 @@ def compare(
         raise CheckFailed(f"not converged: {'; '.join(failed)}")
 
 
-def _fits(folder: Path, problem: Problem, preset: str, seed: int) -> bool:
+def _earlier(
+    folder: Path, problem: Problem, kind: Kind, preset: PresetChoice, seed: int, iterations: int | None
+) -> dict[str, Any] | None:
+    """Training report of a barrier in the folder that this very training would give; None if there is none."""
     try:
         stored = load_barrier(folder)
         stored.barrier(problem)
     except InputError:
-        return False
+        return None
     training = stored.data["training"]
-    return stored.spec == problem.robot.spec.barrier and (training.get("preset"), training.get("seed")) == (
-        preset,
-        seed,
-    )
+    wanted = {"preset": preset, "seed": seed, "kind": kind, "iterations": iterations}
+    goal = problem.model.to_angles(problem.robot.goal).tolist()
+    same = stored.spec == problem.robot.spec.barrier and stored.data.get("goal") == goal
+    return training if same and wanted == {k: training.get(k) for k in wanted} else None
 
 
 def _cases(out_dir: Path) -> list[Case]:
@@ -134,10 +138,13 @@ def _write(
 ) -> list[str]:
     from ppcbf_robots import plots  # matplotlib only where it is needed
 
-    with (out_dir / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    try:
+        with (out_dir / "table.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise InputError(f"{out_dir}/table.csv: cannot be written ({error.strerror})") from None
     plots.plot_runs(problem, runs, out_dir / "runs.png")
     plots.plot_paths(problem, runs, out_dir / "paths.png")
     files = ["table.csv", "runs.png", "paths.png"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.progress import track
 
@@ -14,7 +15,7 @@ from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, em
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
-from ppcbf_robots.rollout import Trajectory
+from ppcbf_robots.rollout import RK4_STEP, Trajectory
 from ppcbf_robots.rollout import simulate as rollout
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array, vector
@@ -54,13 +55,28 @@ def simulate(
     problem.check_start(q)
     if out_file.is_dir():
         raise InputError(f"--out: {out_file} is a folder; give a file such as {out_file}/trajectory.npz")
-    chosen, config = choose_barrier(problem, barrier, filter, metric, solver, 1.0 / rate)
+    dt = RK4_STEP * max(1, round(1.0 / (rate * RK4_STEP)))  # whole integration steps
+    if abs(dt * rate - 1.0) > 1e-6:
+        err.print(f"--rate {rate:g} is rounded to {1.0 / dt:.5g} Hz, whole integration steps of {RK4_STEP} s")
+    chosen, config = choose_barrier(problem, barrier, filter, metric, solver, dt)
     trajectory = run(problem, chosen, config, q, v, duration, {"barrier": barrier})
     trajectory.save(out_file)
-    facts = trajectory.summary(model) | {"out": str(out_file)}
+    facts = trajectory.summary(model) | {"outside_domain": outside_domain(problem, trajectory), "out": str(out_file)}
     emit_json(facts) if json else _print(facts, trajectory, problem)
+    if chosen is not None and facts["outside_domain"] > 0.0:
+        err.print(
+            f"warning: {facts['outside_domain']:.1%} of the states lie outside X, where nothing was trained or checked"
+        )
     if not trajectory.meta["complete"]:
         raise CheckFailed(f"the simulation diverged at {trajectory.t[-1]:.3f} s; {out_file} holds what there is")
+
+
+def outside_domain(problem: Problem, trajectory: Trajectory) -> float:
+    """Share of a trajectory's states outside X (angles of continuous joints are taken as they wrap)."""
+    domain, q = problem.robot.domain, problem.model.to_angles(trajectory.q)
+    out_q = (q < domain.q[:, 0] - 1e-9) | (q > domain.q[:, 1] + 1e-9)
+    out_v = (trajectory.v < domain.v[:, 0] - 1e-9) | (trajectory.v > domain.v[:, 1] + 1e-9)
+    return float(np.mean((out_q | out_v).any(axis=1)))
 
 
 def choose_barrier(
@@ -80,9 +96,8 @@ def choose_barrier(
     if not Path(name).is_dir():
         raise InputError(f"--barrier: '{name}' is neither a barrier folder nor one of lb-cbf, pp-cbf, none")
     stored = load_barrier(Path(name))
-    trained = stored.filter
-    config = FilterConfig(kind=kind or trained["kind"], metric=metric or trained["metric"], alpha=trained["alpha"],
-                          solver=solver, dt=dt)  # fmt: skip
+    asked = {k: x for k, x in (("kind", kind), ("metric", metric)) if x is not None}
+    config = stored.filter_config(solver=solver, dt=dt, **asked)
     return stored.barrier(problem), config
 
 

@@ -31,7 +31,7 @@ def train(
     out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the barrier.")],
     barrier: Annotated[Kind, typer.Option(help="PP-NCBF (limits and passivity) or NCBF (limits).")] = "pp-ncbf",
     preset: Annotated[PresetChoice, typer.Option(help="Recommended settings, or the paper's.")] = "default",
-    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of every random draw.")] = 0,
     device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
     gamma: Annotated[float | None, typer.Option(help="gamma of phi = dh/dt + gamma h - K [1/s].")] = None,
     iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
@@ -100,9 +100,18 @@ def train_barrier(
             save_checkpoint(trainer, folder)
 
         result = trainer.run(on_check, time_limit, on_refine=lambda text: err.print(text, style="yellow"))
-    report = result.report() | {"preset": preset_name, "seed": seed, "device": where, "kind": kind}
+    report = result.report() | {
+        "preset": preset_name,
+        "seed": seed,
+        "device": where,
+        "kind": kind,
+        "iterations": iterations,
+    }
     details = {**report, "settings": settings(chosen), "history": _history(result)}
-    save_barrier(folder, problem, kind, chosen.network, result.params, trainer.filter_config, details)
+    if result.check.samples == 0 and (folder / "barrier.json").is_file():
+        err.print(f"{folder}: the barrier already there is kept, for the new one could not be checked")
+    else:
+        save_barrier(folder, problem, kind, chosen.network, result.params, trainer.filter_config, details)
     return {**report, "out": str(folder)}
 
 

@@ -23,7 +23,7 @@ from ppcbf_robots.specs import BarrierSpec, Positive, Spec, validate
 
 FORMAT = 1
 KEYS = {"kind": str, "network": str, "formula": dict, "filter": dict, "fingerprint": dict, "weights_sha256": str,
-        "robot": str, "world": str, "joints": list}  # fmt: skip
+        "robot": str, "world": str, "joints": list, "training": dict}  # fmt: skip
 PACKAGES = ("ppcbf-robots", "pin", "numpy", "torch", "proxsuite")
 
 
@@ -45,6 +45,10 @@ class StoredBarrier:
     filter: dict[str, Any]  # kind, metric and alpha of the filter it was trained for
     data: dict[str, Any]  # barrier.json
 
+    def filter_config(self, **changes: Any) -> FilterConfig:
+        """Settings of the filter the barrier was trained for, with changes such as ``dt`` or ``solver``."""
+        return FilterConfig(**(self.filter | changes))
+
     def barrier(self, problem: Problem) -> Barrier:
         """The barrier on a problem it belongs to; refuses another robot or world.
 
@@ -55,6 +59,7 @@ class StoredBarrier:
         words = {
             "urdf": "another robot (its URDF differs)",
             "robot": "other robot parameters (joints, limits, payload or body spheres differ)",
+            "task": "another controller or domain X (gains or ranges differ)",
             "world": "another world (the obstacles differ)",
         }
         for key, what in words.items():

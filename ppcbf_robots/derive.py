@@ -75,7 +75,12 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
     f_max = f_max if spec.max_spring is None else per_joint(spec.max_spring, names, "controller.max_spring", f_max)
     for what, values, least in (("kp", kp, 0.0), ("kd", kd, 0.0), ("max_spring", f_max, 1e-9)):
         if np.any(values < least):
-            raise InputError(f"controller.{what}: must not be negative, got {values.tolist()}")
+            raise InputError(f"controller.{what}: must be positive, got {values.tolist()}; check gains and `effort`")
+    fastest_mode = max(float(np.linalg.eigvalsh(np.sqrt(kd)[:, None] * Minv * np.sqrt(kd))[-1]) for Minv in Minvs)
+    if fastest_mode * DT > 1.0:
+        robot.warnings.append(
+            f"kd is too large for a 1 kHz loop: λ_max(M⁻¹ K_d) dt reaches {fastest_mode * DT:.2g}, must stay below 1"
+        )
     return Gains(spec.type, kp, kd, f_max)
 
 

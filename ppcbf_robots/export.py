@@ -194,6 +194,7 @@ def _write(path: Path, content: bytes) -> None:
         raise InputError(f"{path} is a folder; give the path of the file to write")
     temporary = path.with_name(f".{path.name}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(content)
         temporary.replace(path)
     except OSError as error:

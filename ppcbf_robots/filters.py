@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
+from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics
 from ppcbf_robots.safety import SafetyFunction
@@ -29,6 +30,7 @@ Box = tuple[Array, Array]  # (n,) bounds of the dimensionless correction
 _TINY = 1e-12
 _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
+NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
 
@@ -57,6 +59,17 @@ class FilterConfig:
     near_rows: int = 10  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
     dt: float = 1e-3  # [s], control period
+
+    def __post_init__(self) -> None:
+        """Refuse what would disable a constraint without a word."""
+        for name, allowed in (("kind", get_args(FilterKind)), ("metric", get_args(Metric))):
+            if getattr(self, name) not in allowed:
+                raise InputError(f"filter {name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
+        for name in ("alpha", "dt", "max_hold", "near_rows"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"filter {name}: must be a positive number, got {getattr(self, name)}")
+        if not (np.isfinite(self.margin) and self.margin >= 0.0):
+            raise InputError(f"filter margin: must be a number of at least 0, got {self.margin}")
 
 
 @dataclass(frozen=True)
@@ -146,7 +159,8 @@ class QPFilter:
         """Left side of every row at δ = 0; the row holds there if it is >= 0."""
         if self.barrier.kind == "pp-cbf":
             return np.asarray(rows.psi(u_des) + self.barrier.spec.gamma_K * rows.phi)
-        return np.asarray(rows.psi(u_des) + self.config.alpha * (rows.phi - self.config.margin))
+        margin = np.clip(rows.phi, 0.0, self.config.margin)  # inside the set no climb back to the margin is asked for
+        return np.asarray(rows.psi(u_des) + self.config.alpha * (rows.phi - margin))
 
     def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
         """The least correction in the configured metric, checked before it is returned."""
@@ -189,14 +203,17 @@ class QPFilter:
         k = int(np.argmin(residual))
         return k if residual[k] < 1e-4 else -1
 
-    @staticmethod
-    def _passivity_row(dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
-        """vᵀ δ <= d_p as (row, lower) of length 1; None where it constrains nothing."""
-        if d_p is None:
+    def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
+        """vᵀ δ <= d_p as (row, lower) of length 1; None near rest.
+
+        There the direction of v is noise, and a milliwatt would be bought with full torque on joints that hardly move;
+        the kinetic metric's correction takes energy out without the row.
+        """
+        if d_p is None or np.all(np.abs(dyn.v) <= NEAR_REST * self.safety.robot.v_max):
             return None
         row = -dyn.v * u_max
         norm = float(np.sqrt(row @ row))
-        return None if norm < 1e-9 else (row / norm, -d_p / norm)
+        return row / norm, -d_p / norm
 
     def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
         H = np.diag(u_max**2) if self.config.metric == "torque" else dyn.Minv * u_max * u_max[:, None]
@@ -238,7 +255,7 @@ class QPFilter:
         """Torque in the box with the least worst violation: one slack shared by all rows, heavily weighted."""
         n = len(u_max)
         reach = np.maximum(C * box[0], C * box[1]).sum(-1)
-        lower = lower - np.max(lower - reach, initial=0.0)  # violated in any case, and perhaps by a huge amount
+        lower = np.minimum(lower, reach)  # each row falls short by what is out of its own reach in any case
         near = np.sort(np.argsort(-lower, kind="stable")[: self.config.near_rows])
         H = np.zeros((n + 1, n + 1))
         H[:n, :n] = self._hessian(dyn, u_max)

@@ -63,8 +63,9 @@ def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> 
         for o in problem.world.obstacles:
             if o.type == "sphere":
                 ax.add_patch(patches.Circle((o.center[0], o.center[k]), o.radius, color="0.7"))
-            elif o.normal[0] != 0.0:
-                ax.axvline(o.offset / o.normal[0], color="0.5", lw=3)
+            elif np.hypot(o.normal[0], o.normal[k]) > 0.999:  # stands upright on the drawn plane
+                at = np.array([o.normal[0], o.normal[k]]) * o.offset
+                ax.axline(tuple(at), tuple(at + np.array([-o.normal[k], o.normal[0]])), color="0.5", lw=3)
         ax.set_xlabel("x [m]")
         ax.set_ylabel(f"{name} [m]")
         ax.set_aspect("equal", adjustable="datalim")

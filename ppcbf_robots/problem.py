@@ -82,7 +82,7 @@ class Problem:
             )
 
     def fingerprint(self) -> dict[str, str]:
-        """SHA-256 of what a barrier depends on: URDF, robot parameters, world."""
+        """SHA-256 of what a barrier depends on: URDF, robot parameters, controller and domain, world."""
         m = self.model
         robot = {
             "joints": m.joint_names,
@@ -92,12 +92,22 @@ class Problem:
             "payload": None if self.robot.spec.payload is None else self.robot.spec.payload.model_dump(),
             "body": [s.model_dump() for s in self.robot.body],
         }
+        gains, domain = self.robot.controller.gains, self.robot.domain
+        task = {
+            "controller": [gains.kind, *(_rounded(x) for x in (gains.kp, gains.kd, gains.max_spring))],
+            "domain": [_rounded(domain.q), _rounded(domain.v)],
+        }
         world = [o.model_dump() for o in self.world.obstacles]
         digest = {
             k: hashlib.sha256(json.dumps(x, sort_keys=True).encode()).hexdigest()
-            for k, x in (("robot", robot), ("world", world))
+            for k, x in (("robot", robot), ("task", task), ("world", world))
         }
         return {"urdf": m.urdf_sha256, **digest}
+
+
+def _rounded(x: Array) -> list[str]:
+    """Six digits: derived numbers differ in the last ones from machine to machine."""
+    return [f"{y:.6g}" for y in x.ravel()]
 
 
 def load_robot(name: str) -> Robot:
@@ -118,6 +128,7 @@ def load_robot(name: str) -> Robot:
     model.check_mass_matrix(domain.sample_q(np.random.default_rng(SAMPLE_SEED), 100))
     derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]
     derived += [f"domain.{k}" for k in ("q", "v") if getattr(spec.domain, k) is None]
+    model.points([s.frame for s in spec.body or []], np.array([s.center for s in spec.body or []]))  # the frames exist
     body = spec.body if spec.body is not None else derive_body(model)
     start = _default_start(model, domain) if spec.start is None else vector(spec.start, model.nv, f"{path}: start")
     goal = _default_goal(start, domain) if spec.goal is None else vector(spec.goal, model.nv, f"{path}: goal")

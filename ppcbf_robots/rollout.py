@@ -63,8 +63,8 @@ class Trajectory:
                 meta = json.loads(str(file["meta"]))
         except FileNotFoundError:
             raise InputError(f"trajectory not found: {path}") from None
-        except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: not a trajectory of `ppcbf simulate` ({error})") from None
+        except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
+            raise InputError(f"{path}: not a trajectory of `ppcbf simulate`") from None
         fits = isinstance(meta, dict) and {"goal", "rests_on"} <= meta.keys()
         if not fits or len({x.shape[:1] for x in data.values()}) != 1:
             raise InputError(f"{path}: not a trajectory of `ppcbf simulate` (its fields do not belong together)")

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.filters import NEAR_REST, ClosedForm, FilterConfig, QPFilter, Status
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array
 
 log = logging.getLogger(__name__)
 
-RESTING_SPEED = 5e-3  # of v_max, below which a corrected arm counts as resting
 RESTING_TIME = 0.02  # [s]
 
 
@@ -58,12 +58,19 @@ class SafetyFilter:
     ) -> None:
         self.robot, self.safety, self.barrier = robot, safety, barrier
         self.config = config or FilterConfig()
-        self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else damping
+        self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
         self.correction = (ClosedForm if self.config.kind == "closed-form" else QPFilter)(barrier, safety, self.config)
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
         self._last_status = Status.FREE
         self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
+        self._invalid_steps = 0  # in a row
+        if self.damping.shape != (robot.nv,) or not np.all(np.isfinite(self.damping) & (self.damping >= 0.0)):
+            raise InputError(f"damping: expected {robot.nv} finite numbers of at least 0, got {self.damping.tolist()}")
+
+    def reset(self) -> None:
+        """Forget the last state, for a clock that starts anew."""
+        self._last, self._invalid_steps = None, 0
 
     def step(self, t: float, q: ArrayLike, v: ArrayLike, u_des: ArrayLike, d_p: float | None = None) -> StepResult:
         """One control step.
@@ -79,16 +86,17 @@ class SafetyFilter:
         Returns:
             A finite torque, inside the box unless the filter is the closed form, and its status.
         """
-        q, v, u_des = (np.asarray(x, dtype=float) for x in (q, v, u_des))
+        q, v, u_des = (_numbers(x) for x in (q, v, u_des))
         problem = self._invalid(t, q, v)
         if problem:
+            self._invalid_steps += 1
             return self._count(self._hold(t, problem))
         return self._count(self.filter(t, self.robot.evaluate(q, v), u_des, d_p))
 
     def filter(self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None) -> StepResult:
         """The step for a state that was already evaluated (and checked)."""
         u_max = self.robot.u_max
-        self._last = (t, dyn.g)
+        self._last, self._invalid_steps = (t, dyn.g), 0
         rows = self.barrier.rows(dyn, self.safety.evaluate(dyn))
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
@@ -111,7 +119,7 @@ class SafetyFilter:
     def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
         """Hardly any speed, now and RESTING_TIME ahead under u."""
         ahead = dyn.v + RESTING_TIME * dyn.Minv @ (u - dyn.b)
-        return bool(np.all(np.maximum(np.abs(dyn.v), np.abs(ahead)) <= RESTING_SPEED * self.robot.v_max))
+        return bool(np.all(np.maximum(np.abs(dyn.v), np.abs(ahead)) <= NEAR_REST * self.robot.v_max))
 
     def _name(self, row: int) -> str:
         return self.safety.names[row] if row >= 0 else ""
@@ -119,7 +127,9 @@ class SafetyFilter:
     def _invalid(self, t: float, q: Array, v: Array) -> str:
         if q.shape != (self.robot.nq,) or v.shape != (self.robot.nv,):
             return f"state of shape {q.shape}, {v.shape} instead of ({self.robot.nq},), ({self.robot.nv},)"
-        if not (np.isfinite(t) and np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+        if not isinstance(t, int | float | np.number) or not np.isfinite(t):
+            return "time not a finite number"
+        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
             return "state not finite"
         c = self.robot.idx_q[self.robot.continuous]
         if np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):
@@ -129,8 +139,14 @@ class SafetyFilter:
         return ""
 
     def _hold(self, t: float, problem: str) -> StepResult:
-        """Gravity torque of the last valid state for at most max_hold, then STOP with zero torque."""
-        if self._last is not None and 0.0 <= t - self._last[0] <= self.config.max_hold:
+        """Gravity torque of the last valid state for at most max_hold, then STOP with zero torque.
+
+        Time is the caller's clock or the count of steps, whichever is longer: the clock may be what failed.
+        """
+        held = self._invalid_steps * self.config.dt
+        if self._last is not None and isinstance(t, int | float | np.number) and np.isfinite(t):
+            held = max(held, t - self._last[0])
+        if self._last is not None and held <= self.config.max_hold:
             g = np.clip(self._last[1], -self.robot.u_max, self.robot.u_max)
             u = g if self.gravity_included else np.zeros_like(g)
             return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
@@ -143,3 +159,11 @@ class SafetyFilter:
             log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)
             self._last_status = result.status
         return result
+
+
+def _numbers(x: ArrayLike) -> Array:
+    """Floats, or an array of no length for what is not numbers, which the checks then refuse."""
+    try:
+        return np.asarray(x, dtype=float)
+    except (TypeError, ValueError):
+        return np.zeros(0)

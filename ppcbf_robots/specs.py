@@ -20,7 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from ppcbf_robots.errors import InputError
 
 Array = NDArray[np.float64]
-Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # [m]; farther than any arm reaches
+Vector3 = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 PerJoint = float | list[float] | dict[str, float]

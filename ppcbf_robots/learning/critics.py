@@ -35,7 +35,7 @@ def least_row(rows: BarrierRows) -> BarrierRows:
 def closed_form_critics(
     rows: BarrierRows, v: Any, u_des: Any, d_p: Any, u_max: Any, metric: Metric, margin: float, p_ref: float
 ) -> tuple[Any, Any]:
-    """Torque critic (18) relative to u_max and passivity critic (17) relative to |v| |u_sc|, (B,) each.
+    """Torque critic (18) relative to u_max and passivity critic (17) relative to p_ref [W], (B,) each.
 
     The torque critic asks for ``margin`` in reserve, the passivity critic for a hundredth of |v| |u_sc|. They are
     zero where psi(u_des) >= 0, since nothing is corrected there.

@@ -27,6 +27,7 @@ from ppcbf_robots.specs import Array
 LearnedKind = Literal["ncbf", "pp-ncbf"]
 CHECK_STATES = 4_000
 COUNTEREXAMPLE_COPIES = 50  # how often a counterexample's ray stands in the pool
+MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
 CANDIDATES = 3  # clean parameter sets tried in the final check
 MAX_REFINED_MARGIN = 0.1
 
@@ -145,9 +146,8 @@ class Trainer:
 
     def identity(self) -> str:
         """What a checkpoint must share with this run to be resumed."""
-        return json.dumps(
-            [self.problem.fingerprint(), self.spec.model_dump(), self.kind, settings(self.preset), self.seed]
-        )
+        problem = [self.problem.fingerprint(), self.problem.robot.goal.tolist(), self.spec.model_dump()]
+        return json.dumps([*problem, self.kind, settings(self.preset), self.seed])
 
     def run(
         self,
@@ -166,7 +166,10 @@ class Trainer:
                 self._descend(on_check, time_limit)
             except KeyboardInterrupt:
                 interrupted = True
-            found = self._final_check()
+            try:
+                found = self._final_check()
+            except KeyboardInterrupt:
+                found, interrupted = [], True
             tested = sorted([*tested, *found], key=lambda t: (t.check.share, -t.volume_kept))
             out_of_time = time.monotonic() - self.started > time_limit
             done = bool(tested) and tested[0].check.violations == 0
@@ -296,15 +299,19 @@ class Trainer:
         """Run the filter on uniform band states for the largest clean candidates until one has no violation."""
         tested = []
         for volume, params in self.clean:
-            barrier = self.problem.barrier(self.kind, NumpyNetwork(self.preset.network, params))
-            check = check_band(
-                self.problem, barrier, self.filter_config, self.preset.test_samples, self.rng, self.kind == "pp-ncbf"
-            )
+            check = self._draw_check(params)
+            if check.samples and not check.violations:  # selected by this draw, so only a fresh one is evidence
+                check = self._draw_check(params)
             if check.samples:
                 tested.append(Tested(params, check, volume))
             if check.samples and not check.violations:
                 break
         return tested
+
+    def _draw_check(self, params: dict[str, Array]) -> BandCheck:
+        barrier = self.problem.barrier(self.kind, NumpyNetwork(self.preset.network, params))
+        passive = self.kind == "pp-ncbf"
+        return check_band(self.problem, barrier, self.filter_config, self.preset.test_samples, self.rng, passive)
 
     def _refine(self, tested: list[Tested]) -> None:
         """Counterexamples join the pool, the margin grows, and training goes on for half as long."""
@@ -332,8 +339,8 @@ class Trainer:
         if volume < self.preset.min_volume or not check.tried:
             why = "collapsed" if volume < self.preset.min_volume else "no clean barrier was found"
             reason = f"{why}: the safe set keeps {volume:.1%} of the LB set"
-        elif not check.samples:
-            reason = "collapsed: no state was found on the band"
+        elif check.samples < MIN_SAMPLES:
+            reason = f"only {check.samples} states were found on the band, too few to tell"
         elif check.violations:
             reason = f"{check.violations} of {check.samples} uniform band states violate the limits"
         elif not start_inside and self.problem.safety.least(self.problem.robot.start)[0] >= 0.0:
