@@ -34,7 +34,7 @@ def main() -> None:
     """Run the command line; every expected error ends as one sentence and its exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", stream=sys.stderr)
     try:
-        app()
+        app(prog_name="ppcbf")
     except PPCBFError as error:
         err.print(Text.assemble(("error:", "bold red"), " ", str(error)), soft_wrap=True)
         sys.exit(error.exit_code)

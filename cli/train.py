@@ -89,6 +89,8 @@ def train_barrier(
     where = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     if where == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is available here; use --device cpu")
+    if where == "cpu":
+        torch.set_num_threads(1)  # the tensors are small: more threads stall each other on a busy machine
     trainer = Trainer(problem, kind, chosen, seed, where)
     if resume:
         load_checkpoint(trainer, folder)

@@ -75,7 +75,8 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
     f_max = f_max if spec.max_spring is None else per_joint(spec.max_spring, names, "controller.max_spring", f_max)
     for what, values, least in (("kp", kp, 0.0), ("kd", kd, 0.0), ("max_spring", f_max, 1e-9)):
         if np.any(values < least):
-            raise InputError(f"controller.{what}: must be positive, got {values.tolist()}; check gains and `effort`")
+            cause = " (too little effort for gravity and damping?)" if what == "max_spring" else ""
+            raise InputError(f"controller.{what}: must not be negative, got {values.tolist()}{cause}")
     fastest_mode = max(float(np.linalg.eigvalsh(np.sqrt(kd)[:, None] * Minv * np.sqrt(kd))[-1]) for Minv in Minvs)
     if fastest_mode * DT > 1.0:
         robot.warnings.append(

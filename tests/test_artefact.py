@@ -13,6 +13,7 @@ from ppcbf_robots.artefact import StoredBarrier, load_barrier, save_barrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.problem import load_problem
+from ppcbf_robots.resources import find_robot
 from ppcbf_robots.safety_filter import SafetyFilter
 
 CONFIG = FilterConfig(kind="qp", metric="kinetic", alpha=7.0)
@@ -201,9 +202,20 @@ def test_other_robots_and_worlds_are_refused(folder, tmp_path, two_link):
 
 def test_the_same_robot_under_another_name_is_accepted(folder, tmp_path, two_link):
     spec = tmp_path / "same.yaml"
-    spec.write_text(f"urdf: {two_link.model.urdf}\nbody: [{{frame: tip}}]\n")
+    text = find_robot("two_link").read_text(encoding="utf-8")
+    spec.write_text(text.replace("urdf: two_link.urdf", f"urdf: {two_link.model.urdf}"))
     stored = load_barrier(folder)
     assert stored.barrier(load_problem(str(spec), "circle")).spec == stored.spec
+
+
+def test_another_controller_or_domain_is_refused(folder, tmp_path, two_link):
+    text = find_robot("two_link").read_text(encoding="utf-8")
+    text = text.replace("urdf: two_link.urdf", f"urdf: {two_link.model.urdf}")
+    for change in (("kd: 6.0", "kd: 0.0"), ("[-1.0, 1.0]]", "[-9.0, 9.0]]")):
+        spec = tmp_path / "other.yaml"
+        spec.write_text(text.replace(*change))
+        with pytest.raises(InputError, match="another controller or domain X"):
+            load_barrier(folder).barrier(load_problem(str(spec), "circle"))
 
 
 def test_folders_that_cannot_be_written(tmp_path, two_link, network):

@@ -66,7 +66,7 @@ def small_presets() -> Iterator[None]:
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         for name, preset in PRESETS.items():
-            small = {"rays": 1000, "samples": 100, "top": 20, "hidden": (16, 16), "test_samples": 100}
+            small = {"rays": 1000, "samples": 100, "top": 20, "hidden": (16, 16), "test_samples": 200}
             patch.setitem(PRESETS, name, dataclasses.replace(preset, **small))
         yield
     torch.set_num_threads(threads)
@@ -170,9 +170,9 @@ def test_info_warns_of_a_start_and_goal_in_an_obstacle(tmp_path):
 
 def test_train(training, barrier):
     assert set(training) == {"converged", "reason", "volume_kept", "violations", "samples", "start_inside", "seconds",
-                             "steps", "preset", "seed", "device", "kind", "out"}  # fmt: skip
+                             "steps", "preset", "seed", "device", "kind", "iterations", "out"}  # fmt: skip
     assert (training["converged"], training["violations"], training["start_inside"]) == (True, 0, True)
-    assert (training["samples"], training["steps"]) == (100, 50)
+    assert (training["samples"], training["steps"]) == (200, 50)
     assert 0.9 < training["volume_kept"] <= 1.0
     assert {p.name for p in barrier.iterdir()} == {"barrier.json", "weights.safetensors", "checkpoint.safetensors"}
     stored = json.loads((barrier / "barrier.json").read_text())["training"]
@@ -234,7 +234,7 @@ def test_simulate_reports_what_the_trajectory_holds(tmp_path, two_link):
     path = tmp_path / "new" / "t.npz"
     found = facts("simulate", "two_link", "circle", "--duration", 0.1, "--rate", 200, "--out", path)
     assert set(found) == {"min_h", "clearance", "max_torque_ratio", "energy_rise", "injected", "reached_goal",
-                          "goal_error", "cleared_at", "rests_on", "filter_counts", "out"}  # fmt: skip
+                          "goal_error", "cleared_at", "rests_on", "filter_counts", "outside_domain", "out"}  # fmt: skip
     with np.load(path) as file:
         assert len(file["t"]) == sum(found["filter_counts"].values()) == 21
         assert found["min_h"] == file["h"].min()

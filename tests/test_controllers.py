@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ppcbf_robots.controllers import Gains, NominalController
+from ppcbf_robots.derive import derive_gains
 
 KINDS = ["pd_gravity", "shaping", "bounded_spring"]
 DT = 1e-3  # [s], control period the derived gains must suit
@@ -91,8 +92,9 @@ def test_batch_equals_single(problem, controller, states):
 @pytest.mark.parametrize("robot", ["panda", "kinova"])
 def test_derived_gains_fit_the_torque_box_and_the_control_period(problems, states, robot):
     problem = problems[robot]
-    model, controller = problem.model, problem.robot.controller
-    kd = controller.gains.kd
+    model = problem.model
+    gains = derive_gains(model, None, problem.robot.domain)
+    controller, kd = NominalController(model, gains, problem.robot.goal), gains.kd
     for q, v in states(problem, 300, seed=7):
         dyn = model.evaluate(q, v)
         assert np.all(np.abs(controller.evaluate(dyn).u) <= 1.02 * model.u_max)

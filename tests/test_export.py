@@ -271,9 +271,8 @@ def test_missing_onnx_is_told_with_the_remedy(monkeypatch: pytest.MonkeyPatch, t
 def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
     stored = stored_barrier("two_link", "mlp")
     (tmp_path / "file").write_text("kept")
-    for folder in ("missing", "file"):
-        with pytest.raises(InputError, match=r"barrier\.npz: cannot be written \("):
-            export_barrier(stored, tmp_path / folder / "barrier.npz", "npz")
+    with pytest.raises(InputError, match=r"barrier\.npz: cannot be written \("):
+        export_barrier(stored, tmp_path / "file" / "barrier.npz", "npz")
     with pytest.raises(InputError, match="is a folder; give the path of the file to write"):
         export_barrier(stored, tmp_path, "c")
     assert [p.name for p in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "kept"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,14 +22,14 @@ from ppcbf_robots.learning.critics import closed_form_critics, feasibility_margi
 from ppcbf_robots.learning.parameters import initial_parameters
 from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS
 from ppcbf_robots.learning.rays import FAR, Field, Rays, build_pool, rays_at, to_tensors
-from ppcbf_robots.learning.train import Monitor, Result, Trainer, settings
+from ppcbf_robots.learning.train import MIN_SAMPLES, Monitor, Result, Trainer, settings
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.safety_filter import SafetyFilter
 
 CPU, DOUBLE = torch.device("cpu"), torch.float64
 TINY = dataclasses.replace(
-    DEFAULT, rays=500, samples=100, top=20, hidden=(16, 16), units=4, iterations=8, check_every=2, test_samples=100,
+    DEFAULT, rays=500, samples=100, top=20, hidden=(16, 16), units=4, iterations=8, check_every=2, test_samples=200,
     refinements=1,
 )  # fmt: skip
 TINY_PAPER = dataclasses.replace(TINY, network="mlp", filter="closed-form", metric="torque", l2=1e-2)
@@ -428,7 +429,7 @@ def test_ctrl_c_keeps_the_best_barrier(two_link):
     assert (result.converged, result.steps) == (True, 4)
     assert result.reason == "interrupted; the best barrier so far is clean"
     assert_same_weights(result.params, trainer.clean[0][1])
-    assert result.check.samples == 100 and not result.check.violations
+    assert result.check.samples == 200 and not result.check.violations
 
 
 def test_of_clean_barriers_the_largest_is_kept(two_link, monkeypatch):
@@ -476,14 +477,28 @@ def test_nothing_clean_is_not_converged(cartpole):
 
 def test_violations_are_not_converged_and_refined(two_link, monkeypatch):
     q, v = draw(two_link, 3, seed=2)
-    monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: BandCheck(100, 3, 1000, q, v))
+    monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: BandCheck(300, 3, 9000, q, v))
     notes: list[str] = []
     trainer, result = train(two_link, on_refine=notes.append)
-    assert (result.converged, result.reason) == (False, "3 of 100 uniform band states violate the limits")
-    assert notes == ["3 of 100 uniform band states violate: refining"]
+    assert (result.converged, result.reason) == (False, "3 of 300 uniform band states violate the limits")
+    assert notes == ["3 of 300 uniform band states violate: refining"]
     assert trainer.margin == pytest.approx(1.5 * TINY.margin)
     assert trainer.planned == TINY.iterations * 3 // 2
     assert len(trainer.counterexamples) == 1
+
+
+def test_only_a_fresh_draw_is_evidence(two_link, monkeypatch):
+    """The candidate was chosen for being clean on the first draw."""
+    draws = itertools.cycle([BandCheck(300, 0, 9000), BandCheck(300, 3, 9000, *draw(two_link, 3, seed=2))])
+    monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: next(draws))
+    _, result = train(two_link)
+    assert (result.converged, result.check.violations) == (False, 3)
+
+
+def test_too_few_states_are_no_evidence(two_link):
+    _, result = train(two_link, dataclasses.replace(TINY, test_samples=MIN_SAMPLES - 1))
+    assert (result.converged, result.check.violations) == (False, 0)
+    assert result.reason == f"only {MIN_SAMPLES - 1} states were found on the band, too few to tell"
 
 
 def test_a_start_outside_is_not_converged(two_link):

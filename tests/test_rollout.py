@@ -158,7 +158,7 @@ def test_other_files_are_refused(tmp_path, kind):
     NOT_TRAJECTORIES[kind](path)
     with pytest.raises(InputError) as error:
         Trajectory.load(path)
-    assert str(error.value).startswith(f"{path}: not a trajectory of `ppcbf simulate` (")
+    assert str(error.value).startswith(f"{path}: not a trajectory of `ppcbf simulate`")
     assert "\n" not in str(error.value)
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.qp import make_solver
+from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import BarrierSpec
 
@@ -140,8 +141,11 @@ def test_noise_near_rest_buys_no_power_with_full_torque(two_link, panda, case):
         q, goal = problem.robot.start.copy(), problem.robot.start.copy()
         q[6], goal[6] = model.q_upper[6] - 1e-4, model.q_upper[6] + 0.6
     else:
-        q, goal = np.array([0.386, 0.513]), np.array([0.9, 0.5])  # tip at the circle, goal inside it
+        q, goal = problem.robot.start, np.array([0.9, 0.5])  # inside the circle
     problem = problem.with_goal(goal)
+    if case == "obstacle":  # come to rest at the circle first
+        plain = SafetyFilter(model, problem.safety, problem.barrier("lb-cbf"))
+        q = simulate(problem.safety, problem.robot.controller, plain, q, np.zeros(2), 6.0, 5e-3).q[-1]
     filter_ = SafetyFilter(model, problem.safety, problem.barrier("lb-cbf"))
     torques = []
     for i in range(300):

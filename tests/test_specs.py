@@ -369,7 +369,7 @@ def test_start_inside_an_obstacle_or_beyond_a_limit(files):
     folder = files(world=changed(WORLD, "[0.5, 0.0, 0.6]", "[0.8, 0.0, 0.0]"))
     problem = load_problem(str(folder / "arm.yaml"), str(folder / "world.yaml"))
     assert message(problem.check_start, np.zeros(2)) == (
-        "the start configuration violates 'tip#1 / ball' by 0.1000: give another with --start, or `start` in the spec"
+        "the start configuration violates 'tip#1 / ball' by 0.1000: give another with --start or in the spec"
     )
     assert message(problem.check_start, np.array([-2.5, 0.0])).startswith(
         "the start configuration violates 'shoulder lower limit' by 0.5000: "
