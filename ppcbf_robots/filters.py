@@ -159,8 +159,7 @@ class QPFilter:
         """Left side of every row at δ = 0; the row holds there if it is >= 0."""
         if self.barrier.kind == "pp-cbf":
             return np.asarray(rows.psi(u_des) + self.barrier.spec.gamma_K * rows.phi)
-        margin = np.clip(rows.phi, 0.0, self.config.margin)  # inside the set no climb back to the margin is asked for
-        return np.asarray(rows.psi(u_des) + self.config.alpha * (rows.phi - margin))
+        return np.asarray(rows.psi(u_des) + self.config.alpha * (rows.phi - self.config.margin))
 
     def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
         """The least correction in the configured metric, checked before it is returned."""

@@ -80,7 +80,7 @@ class PayloadSpec(Spec):
 class BarrierSpec(Spec):
     """Constants of the barrier formulas (paper, §5); the defaults suit most arms."""
 
-    gamma: Positive = 5.0  # [1/s], of eq. (25)
+    gamma: Annotated[float, Field(ge=0.1)] = 5.0  # [1/s], of eq. (25); less would keep an arm metres away
     alpha_pp: Positive = 100.0  # [J/m], the paper's alpha of the PP-CBF
     gamma_K: Positive = 10.0  # [1/s], of the PP-CBF's zeroing condition
     epsilon: Positive = 0.05  # [m/s], width of the band of eq. (21)

@@ -33,7 +33,7 @@ def qp_slack(barrier, rows, u, config):
     """What the QP's rows ask to be >= 0."""
     if barrier.kind == "pp-cbf":
         return rows.psi(u) + barrier.spec.gamma_K * rows.phi
-    return rows.psi(u) + config.alpha * (rows.phi - np.clip(rows.phi, 0.0, config.margin))
+    return rows.psi(u) + config.alpha * (rows.phi - config.margin)
 
 
 def weight(dyn, metric):
