@@ -14,7 +14,7 @@ from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.filters import Metric
 
 _TINY = 1e-9
-PASSIVITY_RESERVE = 0.02  # of |v| |u_sc|; more of it fights the torque critic
+PASSIVITY_RESERVE = 0.01  # of |v| |u_sc|; more of it fights the torque critic
 DESCENTS = 25  # mirror descent steps towards the worst combination of rows
 DESCENT_RATE = 3.0
 
@@ -37,7 +37,7 @@ def closed_form_critics(
 ) -> tuple[Any, Any]:
     """Torque critic (18) relative to u_max and passivity critic (17) relative to p_ref [W], (B,) each.
 
-    The torque critic asks for ``margin`` in reserve, the passivity critic for a fiftieth of |v| |u_sc|. They are
+    The torque critic asks for ``margin`` in reserve, the passivity critic for a hundredth of |v| |u_sc|. They are
     zero where psi(u_des) >= 0, since nothing is corrected there.
     """
     row = least_row(rows)
