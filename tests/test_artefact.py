@@ -167,7 +167,7 @@ def test_missing_keys(folder, key):
         ({"kind": "magic"}, "unknown kind 'magic' or network"),
         ({"network": "transformer"}, "unknown kind 'pp-ncbf' or network 'transformer'"),
         ({"kind": ["pp-ncbf"]}, "the key 'kind' does not hold a str; the file was altered"),
-        ({"formula": {"gamma": -1.0}}, "formula: gamma: input should be greater than 0"),
+        ({"formula": {"gamma": -1.0}}, "formula: gamma: input should be greater than or equal to 0.1"),
         ({"formula": {"gamma": "x"}}, "formula: gamma: "),
         ({"formula": []}, "the key 'formula' does not hold a dict; the file was altered"),
         ({"joints": 3}, "the key 'joints' does not hold a list; the file was altered"),
