@@ -50,10 +50,10 @@ class StoredBarrier:
         return FilterConfig(**(self.filter | changes))
 
     def barrier(self, problem: Problem) -> Barrier:
-        """The barrier on a problem it belongs to; refuses another robot or world.
+        """The barrier on a problem it belongs to; refuses another robot, controller, domain or world.
 
         Raises:
-            InputError: if URDF, robot parameters or obstacles are not those of the training.
+            InputError: if URDF, robot parameters, gains, domain or obstacles are not those of the training.
         """
         expected, found = self.data["fingerprint"], problem.fingerprint()
         words = {

@@ -77,7 +77,7 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
         if np.any(values < least):
             cause = " (too little effort for gravity and damping?)" if what == "max_spring" else ""
             raise InputError(f"controller.{what}: must not be negative, got {values.tolist()}{cause}")
-    fastest_mode = max(float(np.linalg.eigvalsh(np.sqrt(kd)[:, None] * Minv * np.sqrt(kd))[-1]) for Minv in Minvs)
+    fastest_mode = max(float(_damping_modes(kd, Minv)[0][-1]) for Minv in Minvs)
     if fastest_mode * DT > 1.0:
         robot.warnings.append(
             f"kd is too large for a 1 kHz loop: λ_max(M⁻¹ K_d) dt reaches {fastest_mode * DT:.2g}, must stay below 1"
@@ -90,13 +90,19 @@ def _stable_damping(kd: Array, Minvs: list[Array]) -> Array:
     kd = kd.copy()
     for Minv in Minvs:
         for _ in range(100):
-            root = np.sqrt(kd)
-            values, vectors = np.linalg.eigh(root[:, None] * Minv * root)
+            values, vectors = _damping_modes(kd, Minv)
             excess = values[-1] * DT / DAMPING_LIMIT
             if excess <= 1.0:
                 break
             kd *= 1.0 - vectors[:, -1] ** 2 * (1.0 - 0.95 / excess)  # those joints give way that make the mode fast
     return kd
+
+
+def _damping_modes(kd: Array, Minv: Array) -> tuple[Array, Array]:
+    """Rates [1/s], rising, and shares of the joints of the modes of M⁻¹ K_d, by the similar √K_d M⁻¹ √K_d."""
+    root = np.sqrt(kd)
+    values, vectors = np.linalg.eigh(root[:, None] * Minv * root)
+    return values, vectors
 
 
 def derive_body(robot: RobotModel) -> list[BodySphere]:

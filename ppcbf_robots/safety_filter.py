@@ -95,7 +95,6 @@ class SafetyFilter:
 
     def filter(self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None) -> StepResult:
         """The step for a state that was already evaluated (and checked)."""
-        u_max = self.robot.u_max
         self._last, self._invalid_steps = (t, dyn.g), 0
         rows = self.barrier.rows(dyn, self.safety.evaluate(dyn))
         offset = 0.0 if self.gravity_included else dyn.g
@@ -105,16 +104,19 @@ class SafetyFilter:
             usable and (d_p is None or np.isfinite(d_p)) and bool(np.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum()))
         )
         if not usable:
-            u = np.clip(dyn.g - self.damping * dyn.v, -u_max, u_max) - offset
+            u = self._fallback(dyn) - offset
             return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")
-        c = self.correction.correct(dyn, rows, u_des + offset, d_p, u_max)
+        c = self.correction.correct(dyn, rows, u_des + offset, d_p, self.robot.u_max)
         if c.status is Status.FAULT:
-            u = np.clip(dyn.g - self.damping * dyn.v, -u_max, u_max)
-            return StepResult(u - offset, c.status, c.reason, h, phi, self._name(c.row))
+            return StepResult(self._fallback(dyn) - offset, c.status, c.reason, h, phi, self._name(c.row))
         status = c.status
         if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
             status = Status.RESTING
         return StepResult(c.u - offset, status, c.reason, h, phi, self._name(c.row))
+
+    def _fallback(self, dyn: Dynamics) -> Array:
+        """``sat(g - K_d v)``: kinetic energy cannot grow under it."""
+        return np.clip(dyn.g - self.damping * dyn.v, -self.robot.u_max, self.robot.u_max)
 
     def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
         """Hardly any speed, now and RESTING_TIME ahead under u."""
