@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ppcbf_robots.barriers import Barrier, BarrierKind, EnergyBarrier, RhoBarrier
+from ppcbf_robots.body import body_spheres
 from ppcbf_robots.controllers import NominalController
 from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_body, derive_domain, derive_gains
 from ppcbf_robots.errors import InputError
@@ -19,7 +20,8 @@ from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
-from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, WorldSpec, load_spec, vector
+from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_spec, vector
+from ppcbf_robots.world import WorldSpec
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def load_robot(name: str) -> Robot:
     derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]
     derived += [f"domain.{k}" for k in ("q", "v") if getattr(spec.domain, k) is None]
     model.points([s.frame for s in spec.body or []], np.array([s.center for s in spec.body or []]))  # the frames exist
-    body = spec.body if spec.body is not None else derive_body(model)
+    body = body_spheres(spec.body) if spec.body is not None else derive_body(model)
     start = _default_start(model, domain) if spec.start is None else vector(spec.start, model.nv, f"{path}: start")
     goal = _default_goal(start, domain) if spec.goal is None else vector(spec.goal, model.nv, f"{path}: goal")
     velocity = spec.start_velocity or [0.0] * model.nv

@@ -13,7 +13,8 @@ import numpy as np
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.robot import Dynamics, RobotModel
-from ppcbf_robots.specs import Array, BodySphere, HalfSpace, Sphere
+from ppcbf_robots.specs import Array, BodySphere
+from ppcbf_robots.world import HalfSpace, Sphere
 
 _TINY = 1e-9  # [m], below which the direction away from a sphere's centre is not defined
 

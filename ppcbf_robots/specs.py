@@ -1,11 +1,10 @@
-"""What users write: robot specs and worlds in YAML, validated before anything is built.
+"""Robot specs in YAML, and the strictness that they share with worlds (:mod:`ppcbf_robots.world`).
 
 Lengths are metres, angles radians, masses kilograms, efforts newton-metres or newtons.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import reprlib
 from collections.abc import Hashable, Sequence
@@ -15,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ppcbf_robots.errors import InputError
 
@@ -43,12 +42,21 @@ class ControllerSpec(Spec):
     max_spring: PerJoint | None = None  # [N m | N], bounded_spring only
 
 
-class BodySphere(Spec):
-    """A sphere fixed to a link or frame; radius 0 is a point."""
+class BodyPrimitive(Spec):
+    """A sphere fixed to a link or frame (radius 0 is a point), or with ``to`` a capsule from ``center`` to ``to``."""
 
     frame: str
     center: Vector3 = [0.0, 0.0, 0.0]
+    to: Vector3 | None = None
     radius: NonNegative = 0.0
+
+
+class BodySphere(Spec):
+    """A sphere fixed to a link or frame; what every body primitive becomes."""
+
+    frame: str
+    center: Vector3
+    radius: NonNegative
 
 
 class DomainSpec(Spec):
@@ -96,59 +104,13 @@ class RobotSpec(Spec):
     effort: PerJoint | None = None
     velocity: PerJoint | None = None
     controller: ControllerSpec | None = None
-    body: list[BodySphere] | None = None
+    body: list[BodyPrimitive] | None = None
     domain: DomainSpec = DomainSpec()
     start: list[float] | None = None
     start_velocity: list[float] | None = None
     goal: list[float] | None = None
     payload: PayloadSpec | None = None
     barrier: BarrierSpec = BarrierSpec()
-
-
-class Sphere(Spec):
-    """Solid ball."""
-
-    type: Literal["sphere"]
-    name: str
-    center: Vector3
-    radius: Positive
-    margin: NonNegative = 0.0
-
-
-class HalfSpace(Spec):
-    """Everything with ``normal . p < offset`` is solid; the free side is ``normal . p >= offset``."""
-
-    type: Literal["half_space"]
-    name: str
-    normal: Vector3
-    offset: float
-    margin: NonNegative = 0.0
-
-    @field_validator("normal")
-    @classmethod
-    def _unit(cls, value: list[float]) -> list[float]:
-        norm = math.sqrt(sum(x * x for x in value))
-        if abs(norm - 1.0) > 1e-3:
-            raise ValueError(f"the normal must have length 1, got {norm:.6g}")
-        return [x / norm for x in value]
-
-
-Obstacle = Annotated[Sphere | HalfSpace, Field(discriminator="type")]
-
-
-class WorldSpec(Spec):
-    """The obstacles around the robot, in its base frame."""
-
-    obstacles: Annotated[list[Obstacle], Field(min_length=1)]
-
-    @field_validator("obstacles")
-    @classmethod
-    def _unique_names(cls, value: list[Sphere | HalfSpace]) -> list[Sphere | HalfSpace]:
-        names = [o.name for o in value]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"two obstacles are named '{name}'; give each its own name")
-        return value
 
 
 class _Loader(yaml.SafeLoader):
@@ -176,6 +138,7 @@ _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), list("tTfF")
 )
 
+SHAPES = ("sphere", "half_space", "box", "capsule", "cylinder", "mesh")  # of obstacles, also in pydantic's locations
 S = TypeVar("S", bound=Spec)
 MAX_SPEC_BYTES = 4_000_000
 
@@ -228,11 +191,7 @@ def validate(data: dict[str, Any], kind: type[S], where: str) -> S:
 
 def _first_problem(error: ValidationError, kind: type[Spec]) -> str:
     problem = error.errors(include_url=False)[0]
-    loc = [
-        str(x)
-        for x in problem["loc"]
-        if str(x) not in ("sphere", "half_space", "float", "list[float]", "dict[str,float]")
-    ]
+    loc = [str(x) for x in problem["loc"] if str(x) not in (*SHAPES, "float", "list[float]", "dict[str,float]")]
     key = ".".join(loc) or "file"
     if problem["type"] == "extra_forbidden":
         known = ", ".join(kind.model_fields) if len(loc) == 1 else "see the README's list of keys"

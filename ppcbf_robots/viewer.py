@@ -21,9 +21,10 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import Status
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.rollout import Trajectory
-from ppcbf_robots.specs import Array, Obstacle, Sphere
+from ppcbf_robots.specs import Array
 from ppcbf_robots.viewer_page import PageServer, Recorder, render
 from ppcbf_robots.viewer_shapes import align, ball, beads, floor_grid, robot_parts
+from ppcbf_robots.world import Obstacle, Sphere
 
 FPS = 30
 ROBOT_COLORS = (0x5B8FD0, 0x63AD72, 0x9B7CC8, 0x3FB0B8, 0xB58A6A, 0x8A93A0)

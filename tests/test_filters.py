@@ -19,7 +19,8 @@ from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.safety_filter import SafetyFilter
-from ppcbf_robots.specs import BarrierSpec, HalfSpace
+from ppcbf_robots.specs import BarrierSpec
+from ppcbf_robots.world import HalfSpace
 
 METRICS = ["torque", "kinetic"]
 

@@ -14,7 +14,7 @@ import pytest
 LAYERS = [
     ["errors"],
     ["specs", "resources"],
-    ["urdf"],
+    ["urdf", "world", "body"],
     ["robot"],
     ["safety", "controllers", "network"],
     ["barriers", "derive", "qp"],

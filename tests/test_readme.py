@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from ppcbf_robots.cli.main import main
-from ppcbf_robots.specs import RobotSpec, WorldSpec
+from ppcbf_robots.specs import RobotSpec
+from ppcbf_robots.world import WorldSpec
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 SMALLER = {

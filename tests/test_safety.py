@@ -9,7 +9,8 @@ import pytest
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.safety import SafetyFunction, obstacle_distance
-from ppcbf_robots.specs import BodySphere, HalfSpace, Sphere
+from ppcbf_robots.specs import BodySphere
+from ppcbf_robots.world import HalfSpace, Sphere
 
 MIXED = [
     Sphere(type="sphere", name="ball", center=[0.4, 0.3, 0.5], radius=0.15, margin=0.02),

@@ -13,7 +13,8 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import load_problem, load_robot, parse_vector
 from ppcbf_robots.resources import find_world
 from ppcbf_robots.safety import SafetyFunction
-from ppcbf_robots.specs import RobotSpec, WorldSpec, load_spec, per_joint, vector
+from ppcbf_robots.specs import RobotSpec, load_spec, per_joint, vector
+from ppcbf_robots.world import WorldSpec
 
 INERTIAL = """<inertial><origin xyz="0.2 0 0" rpy="0 0 0"/><mass value="1"/>
     <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>"""
