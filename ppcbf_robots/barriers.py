@@ -42,13 +42,12 @@ class BarrierRows:
 
 
 def rho_rows(
-    h: Any, grad: Any, curvature: Any, v: Any, Minv: Any, b: Any, gamma: float, K: Any, K_q_rate: Any, K_v: Any
+    h: Any, hdot: Any, grad: Any, curvature: Any, Minv: Any, b: Any, gamma: float, K: Any, K_q_rate: Any, K_v: Any
 ) -> BarrierRows:
     """Rows of ``phi = ḣ + gamma h - K`` for numpy or torch arrays.
 
     K (...), K_q_rate (...) = ∂K/∂q · q̇, K_v (..., nv) = ∂K/∂v; b = C v + g.
     """
-    hdot = (grad @ v[..., None])[..., 0]
     w = grad - K_v[..., None, :]
     Lg_phi = w @ Minv
     Lf_phi = curvature + gamma * hdot - K_q_rate[..., None] - (Lg_phi @ b[..., None])[..., 0]
@@ -83,7 +82,16 @@ class RhoBarrier:
             K, K_q, K_v = self.network.value_and_grad(dyn.q, dyn.v)
             K_q_rate = (K_q * self.robot.q_rate(dyn.q, dyn.v)).sum(-1)
         return rho_rows(
-            safety.h, safety.grad, safety.curvature, dyn.v, dyn.Minv, dyn.b, self.spec.gamma, K, K_q_rate, K_v
+            safety.h,
+            safety.hdot(dyn.v),
+            safety.grad,
+            safety.curvature,
+            dyn.Minv,
+            dyn.b,
+            self.spec.gamma,
+            K,
+            K_q_rate,
+            K_v,
         )
 
 
@@ -98,10 +106,8 @@ class EnergyBarrier:
     def rows(self, dyn: Dynamics, safety: SafetyRows) -> BarrierRows:
         """``phi = alpha h - T`` and ``d/dt ½ vᵀ M v = vᵀ (u - g)``, so ``L_g phi = -vᵀ``."""
         alpha = self.spec.alpha_pp
-        v = dyn.v[..., None, :]
-        hdot = (safety.grad * v).sum(-1)
-        Lf_phi = alpha * hdot + (dyn.v * dyn.g).sum(-1)[..., None]
-        Lg_phi: Array = np.broadcast_to(-v, safety.grad.shape)
+        Lf_phi = alpha * safety.hdot(dyn.v) + (dyn.v * dyn.g).sum(-1)[..., None]
+        Lg_phi: Array = np.broadcast_to(-dyn.v[..., None, :], safety.grad.shape)
         Mv = (dyn.M @ dyn.v[..., None])[..., 0]
         w = np.broadcast_to(-Mv[..., None, :], safety.grad.shape)
         return BarrierRows(safety.h, alpha * safety.h - dyn.kinetic_energy[..., None], Lf_phi, Lg_phi, w)

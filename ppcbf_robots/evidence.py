@@ -66,13 +66,16 @@ def uniform_band(
 
 
 def _least_phi(problem: Problem, barrier: Barrier, q: Array, h: Array, grad: Array, v: Array) -> Array:
-    """min_k phi_k at velocities v (B, V, nv) of configurations q (B, nq); needs no dynamics for rho barriers."""
+    """min_k phi_k at velocities v (B, V, nv) of configurations q (B, nq); needs no dynamics for rho barriers.
+
+    Where rho < 0, rho itself is returned: K >= 0 only takes away from it, and the network is what takes time.
+    """
     network = getattr(barrier, "network", None)
-    rho = (np.einsum("bkn,bvn->bvk", grad, v) + barrier.spec.gamma * h[:, None, :]).min(axis=-1)
-    if network is None:
-        return np.asarray(rho)
-    K = network.value_and_grad(np.broadcast_to(q[:, None, :], (*v.shape[:2], q.shape[-1])), v)[0]
-    return np.asarray(rho - K)
+    phi = np.asarray((np.einsum("bkn,bvn->bvk", grad, v) + barrier.spec.gamma * h[:, None, :]).min(axis=-1))
+    if network is not None:
+        b, i = np.nonzero(phi >= 0.0)
+        phi[b, i] -= network.value(q[b], v[b, i])
+    return phi
 
 
 def volume_ratio(

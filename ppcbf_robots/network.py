@@ -130,6 +130,10 @@ class NumpyNetwork:
         self.kind: NetworkKind = kind
         self.params = {k: np.asarray(w, dtype=np.float64) for k, w in params.items()}
 
+    def value(self, q: Any, v: Any) -> Any:
+        """K (...) alone, for q (..., nq) and v (..., nv)."""
+        return value_along(np, self.kind, self.params, q, v)(np.ones(np.shape(v)[:-1]))
+
     def value_and_grad(self, q: Any, v: Any) -> tuple[Any, Any, Any]:
         """See :func:`value_and_grad`."""
         return value_and_grad(np, self.kind, self.params, q, v)

@@ -16,13 +16,9 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.kernels import points_at
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, per_joint, vector
 from ppcbf_robots.urdf import check_urdf
-
-# p @ _SKEW is [p]x, the matrix of p x (.), row by row
-_SKEW = np.array(
-    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], dtype=np.float64
-)
 
 PD_RELATIVE_FLOOR = 1e-10  # least over largest eigenvalue of M below which M counts as singular
 
@@ -68,7 +64,7 @@ class BodyPoints:
     """Points fixed to moving joints (parent joint, offset in the joint's frame [m])."""
 
     def __init__(self, robot: RobotModel, joints: Sequence[int], offsets: Array) -> None:
-        self.joints = np.asarray(joints, dtype=int)
+        self.joints = np.asarray(joints, dtype=np.int64)
         self.offsets = np.concatenate(
             [np.asarray(offsets, float).reshape(-1, 3), np.ones((len(self.joints), 1))], axis=1
         )
@@ -79,20 +75,15 @@ class BodyPoints:
 
     def kinematics(self, dyn: Dynamics) -> PointKinematics:
         """Position, Jacobian and J̇ v of every point; leading batch axes follow ``dyn``."""
-        T = dyn.placements[..., self.joints, :, :]
-        p = (T[..., :3, :] @ self.offsets[..., None])[..., 0]
-        skew = (p @ _SKEW).reshape(*p.shape[:-1], 3, 3)
-        lin, ang = dyn.J[..., None, :3, :], dyn.J[..., None, 3:, :]
-        mask = self.mask[:, None, :]
-        J = (lin - skew @ ang) * mask
-        v = dyn.v[..., None, :, None]
-        omega = ((ang * mask) @ v)[..., 0]
-        a_lin = ((dyn.dJ[..., None, :3, :] * mask) @ v)[..., 0]
-        a_ang = (dyn.dJ[..., None, 3:, :] * mask) @ v
-        velocity = J @ v
-        omega_skew = (omega @ _SKEW).reshape(*p.shape[:-1], 3, 3)
-        Jdot_v = a_lin - (skew @ a_ang)[..., 0] + (omega_skew @ velocity)[..., 0]
-        return PointKinematics(p, J, Jdot_v)
+        lead, nv = dyn.v.shape[:-1], dyn.v.shape[-1]
+        count, points = int(np.prod(lead, dtype=int)), len(self)
+        p, Jdot_v, J = np.empty((count, points, 3)), np.empty((count, points, 3)), np.empty((count, points, 3, nv))
+        points_at(
+            dyn.placements.reshape(count, -1, 4, 4), dyn.J.reshape(count, 6, nv), dyn.dJ.reshape(count, 6, nv),
+            dyn.v.reshape(count, nv), self.joints, self.offsets, self.mask, p, J, Jdot_v,
+        )  # fmt: skip
+        shape = (*lead, points, 3)
+        return PointKinematics(p.reshape(shape), J.reshape(*shape, nv), Jdot_v.reshape(shape))
 
 
 class RobotModel:

@@ -1,7 +1,8 @@
 """Safety functions h_k(q): signed distances of body spheres to obstacles, and joint limits, to second order.
 
-One row k per pair of body sphere and obstacle, and one per finite joint limit; safe is ``h_k >= 0`` for all k. A world
-is a family of rows, not one smooth minimum, whose curvature would be large and false.
+One row k per pair of body sphere and obstacle, per pair of body spheres that could collide, and per finite joint limit;
+safe is ``h_k >= 0`` for all k. A world is a family of rows, not one smooth minimum, whose curvature would be large and
+false. The geometry runs compiled (:mod:`ppcbf_robots.kernels`), for one state or a batch alike.
 """
 
 from __future__ import annotations
@@ -12,20 +13,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.kernels import rows_at
 from ppcbf_robots.robot import Dynamics, RobotModel
+from ppcbf_robots.shapes import Packed, pack
 from ppcbf_robots.specs import Array, BodySphere
-from ppcbf_robots.world import HalfSpace, Sphere
-
-_TINY = 1e-9  # [m], below which the direction away from a sphere's centre is not defined
+from ppcbf_robots.world import Obstacle
 
 
 @dataclass(frozen=True)
 class SafetyRows:
-    """h_k with first and second order terms: ḣ = grad v, ḧ = curvature + grad a."""
+    """h_k with first and second order terms: ``ḣ = grad v + drift``, ``ḧ = curvature + grad a``."""
 
     h: Array  # (..., rows) [m], joint limits [rad | m]
     grad: Array  # (..., rows, nv)
-    curvature: Array  # (..., rows) = vᵀ ∇²h v, including n · J̇ v
+    drift: Array  # (..., rows) = ∂h/∂t [m/s], not zero where the obstacle moves
+    curvature: Array  # (..., rows): vᵀ ∇²h v, n · J̇ v, and the terms of the obstacle's motion
+
+    def hdot(self, v: Array) -> Array:
+        """ḣ (..., rows) at velocity v (..., nv)."""
+        return np.asarray((self.grad @ v[..., None])[..., 0] + self.drift)
 
 
 class SafetyFunction:
@@ -34,8 +40,10 @@ class SafetyFunction:
     Args:
         robot: the robot.
         body: its body spheres.
-        obstacles: solid spheres and half-spaces in the base frame.
+        obstacles: solid obstacles in the base frame.
         joint_limits: whether finite joint limits are rows too (Remark 1 of the paper).
+        domain: (nv, 2) position ranges that count as joint limits where they are tighter than the robot's.
+        self_pairs: indices (S, 2) of body spheres that must not touch each other.
 
     Raises:
         InputError: if an obstacle contains the base, or no body sphere is given.
@@ -45,78 +53,64 @@ class SafetyFunction:
         self,
         robot: RobotModel,
         body: Sequence[BodySphere],
-        obstacles: Sequence[Sphere | HalfSpace],
+        obstacles: Sequence[Obstacle],
         joint_limits: bool = True,
+        domain: Array | None = None,
+        self_pairs: Sequence[tuple[int, int]] = (),
     ) -> None:
         if not body:
             raise InputError("the robot has no body spheres; give `body` in the robot spec")
         self.robot, self.body, self.obstacles = robot, list(body), list(obstacles)
-        for o in self.obstacles:
-            if obstacle_distance(o, np.zeros(3)) < 0.0:
+        self.packed = pack(obstacles)
+        for i, o in enumerate(self.obstacles):
+            if self.packed.distance(i, np.zeros(3)) < 0.0:
                 raise InputError(f"obstacle '{o.name}' contains the robot's base (the origin); move or shrink it")
         self.points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
-        radii = np.array([s.radius for s in body])
-        balls = [o for o in self.obstacles if isinstance(o, Sphere)]
-        planes = [o for o in self.obstacles if isinstance(o, HalfSpace)]
-        self._centers = np.array([o.center for o in balls]).reshape(-1, 3)
-        self._ball_gap = radii[:, None] + np.array([o.radius + o.margin for o in balls])
-        self._normals = np.array([o.normal for o in planes]).reshape(-1, 3)
-        self._plane_gap = radii[:, None] + np.array([o.offset + o.margin for o in planes])
-        self._limits = self._limit_rows(joint_limits)
+        self._radii = np.array([s.radius for s in body])
+        self._self_pairs = np.array(self_pairs, dtype=np.int64).reshape(-1, 2)
+        limits = self._limit_rows(joint_limits, domain)
+        self._limit_joint = np.array([i for i, _, _ in limits], dtype=np.int64)
+        self._limit_sign = np.array([s for _, s, _ in limits])
+        self._limit_bound = np.array([b for _, _, b in limits])
         labels = [f"{s.frame}#{i}" for i, s in enumerate(body)]
-        self.names = [f"{b} / {o.name}" for kind in (balls, planes) for b in labels for o in kind]
+        self.names = [f"{b} / {o.name}" for b in labels for o in self.obstacles]
+        self.names += [f"{labels[a]} / {labels[b]}" for a, b in self._self_pairs]
         self.pairs = len(self.names)
-        self.names += [
-            f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in self._limits
-        ]
+        self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in limits]
         self.rows = len(self.names)
-        self._limit_index = np.array([i for i, _, _ in self._limits], dtype=int)
-        self._limit_sign = np.array([s for _, s, _ in self._limits])
-        self._limit_bound = np.array([b for _, _, b in self._limits])
-        self._limit_grad = np.zeros((len(self._limits), robot.nv))
-        self._limit_grad[np.arange(len(self._limits)), self._limit_index] = self._limit_sign
 
-    def _limit_rows(self, wanted: bool) -> list[tuple[int, float, float]]:
+    def _limit_rows(self, wanted: bool, domain: Array | None) -> list[tuple[int, float, float]]:
+        """(joint, sign, bound) of every finite bound: ``h = sign (q - bound)``."""
         if not wanted:
             return []
-        bounds = [(1.0, self.robot.q_lower), (-1.0, self.robot.q_upper)]
+        lower, upper = self.robot.q_lower, self.robot.q_upper
+        if domain is not None:
+            turning = self.robot.continuous  # an angle that wraps has no bounds
+            lower = np.where(turning, lower, np.maximum(lower, domain[:, 0]))
+            upper = np.where(turning, upper, np.minimum(upper, domain[:, 1]))
+        bounds = [(1.0, lower), (-1.0, upper)]
         return [(i, s, float(b[i])) for s, b in bounds for i in range(self.robot.nv) if np.isfinite(b[i])]
 
-    def evaluate(self, dyn: Dynamics) -> SafetyRows:
-        """h, gradient and curvature of every row; leading batch axes follow ``dyn``."""
-        point = self.points.kinematics(dyn)
-        v = dyn.v[..., None, :, None]
-        velocity = (point.J @ v)[..., 0]  # (..., points, 3)
-        parts = []
-        if len(self._centers):
-            away = point.p[..., :, None, :] - self._centers  # (..., points, balls, 3)
-            D = np.maximum(np.sqrt((away * away).sum(-1)), _TINY)
-            n = away / D[..., None]
-            grad = n @ point.J
-            along = (n @ velocity[..., None])[..., 0]
-            across = (velocity * velocity).sum(-1)[..., None] - along**2
-            curvature = (n @ point.Jdot_v[..., None])[..., 0] + across / D  # H = (I - n nᵀ)/D
-            parts.append((D - self._ball_gap, grad, curvature))
-        if len(self._normals):
-            h = point.p @ self._normals.T - self._plane_gap
-            parts.append((h, self._normals @ point.J, point.Jdot_v @ self._normals.T))
-        lead = dyn.v.shape[:-1]
-        flat = [(h.reshape(*lead, -1), G.reshape(*lead, -1, G.shape[-1]), c.reshape(*lead, -1)) for h, G, c in parts]
-        if len(self._limits):
-            h = self._limit_sign * (self.robot.to_angles(dyn.q)[..., self._limit_index] - self._limit_bound)
-            flat.append((h, np.broadcast_to(self._limit_grad, (*lead, *self._limit_grad.shape)), np.zeros_like(h)))
-        h, grad, curvature = (np.concatenate(x, axis=len(lead)) for x in zip(*flat, strict=True))
-        return SafetyRows(h, grad, curvature)
+    def evaluate(self, dyn: Dynamics, obstacles: Packed | None = None) -> SafetyRows:
+        """h and its terms of every row; leading batch axes follow ``dyn``. ``obstacles``: where they are now."""
+        o, points = obstacles or self.packed, self.points
+        lead, nv = dyn.v.shape[:-1], self.robot.nv
+        count = int(np.prod(lead, dtype=int))
+        h, drift, curvature = (np.empty((count, self.rows)) for _ in range(3))
+        grad = np.empty((count, self.rows, nv))
+        rows_at(
+            dyn.placements.reshape(count, -1, 4, 4), dyn.J.reshape(count, 6, nv), dyn.dJ.reshape(count, 6, nv),
+            dyn.v.reshape(count, nv), self.robot.to_angles(dyn.q).reshape(count, nv),
+            points.joints, points.offsets, points.mask, self._radii,
+            o.kinds, o.sizes, o.margins, o.planes, o.plane_start, o.frames, o.motions,
+            self._self_pairs, self._limit_joint, self._limit_sign, self._limit_bound,
+            h, grad, drift, curvature,
+        )  # fmt: skip
+        shape = (*lead, self.rows)
+        return SafetyRows(h.reshape(shape), grad.reshape(*shape, nv), drift.reshape(shape), curvature.reshape(shape))
 
     def least(self, q: Array) -> tuple[float, str]:
         """Smallest h at rest in q and the name of its row."""
         h = self.evaluate(self.robot.evaluate(q, np.zeros(self.robot.nv))).h
         k = int(np.argmin(h))
         return float(h[k]), self.names[k]
-
-
-def obstacle_distance(obstacle: Sphere | HalfSpace, p: Array) -> float:
-    """Signed distance [m] of a point to an obstacle's surface, margin not counted."""
-    if isinstance(obstacle, Sphere):
-        return float(np.linalg.norm(p - np.asarray(obstacle.center)) - obstacle.radius)
-    return float(np.dot(obstacle.normal, p) - obstacle.offset)

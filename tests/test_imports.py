@@ -13,8 +13,9 @@ import pytest
 
 LAYERS = [
     ["errors"],
-    ["specs", "resources"],
+    ["specs", "resources", "kernels"],
     ["urdf", "world", "body"],
+    ["shapes"],
     ["robot"],
     ["safety", "controllers", "network"],
     ["barriers", "derive", "qp"],
@@ -28,11 +29,13 @@ LAYERS = [
 """From the bottom up; learning and cli are packages. A module imports from lower layers and from its own."""
 
 OWNERS = {
+    "numba": ["kernels"],
+    "scipy": ["shapes"],
     "proxsuite": ["qp"],
     "qpsolvers": ["qp"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
-    "pydantic": ["specs"],
+    "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
     "torch": ["learning", "export", "cli"],

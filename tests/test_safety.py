@@ -8,9 +8,11 @@ import pinocchio as pin
 import pytest
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.safety import SafetyFunction, obstacle_distance
-from ppcbf_robots.specs import BodySphere
-from ppcbf_robots.world import HalfSpace, Sphere
+from ppcbf_robots.kernels import core
+from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.shapes import Motion, Packed, pack, smoothing_gap
+from ppcbf_robots.specs import Array, BodySphere
+from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Obstacle, Sphere
 
 MIXED = [
     Sphere(type="sphere", name="ball", center=[0.4, 0.3, 0.5], radius=0.15, margin=0.02),
@@ -117,11 +119,190 @@ def test_no_body_and_an_obstacle_over_the_base_are_refused(two_link):
     assert str(error.value) == "the robot has no body spheres; give `body` in the robot spec"
     over = Sphere(type="sphere", name="over", center=[0.0, 0.0, 0.05], radius=0.1)
     with pytest.raises(InputError) as error:
-        SafetyFunction(two_link.model, [BodySphere(frame="tip")], [over])
+        SafetyFunction(two_link.model, [BodySphere(frame="tip", center=[0, 0, 0], radius=0)], [over])
     assert str(error.value) == "obstacle 'over' contains the robot's base (the origin); move or shrink it"
 
 
-def test_obstacle_distance_leaves_the_margin_out():
-    ball, table = MIXED[0], MIXED[1]
-    assert obstacle_distance(ball, np.array([0.4, 0.3, 0.9])) == pytest.approx(0.25)
-    assert obstacle_distance(table, np.array([1.0, 2.0, 0.2])) == pytest.approx(0.25)
+# Shapes
+
+WEDGE = [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.3, 0.2, 0.0], [0.15, 0.1, 0.25]]
+POSE = {"xyz": [0.5, -0.1, 0.3], "rpy": [0.4, -0.7, 1.1]}
+SHAPES: list[Obstacle] = [
+    MIXED[2],
+    MIXED[3],
+    Box(type="box", name="box", size=[0.3, 0.2, 0.1], margin=0.01, **POSE),
+    Box(type="box", name="plate", size=[0.3, 0.2, 0.004], **POSE),
+    Capsule(type="capsule", name="capsule", radius=0.05, length=0.3, **POSE),
+    Cylinder(type="cylinder", name="cylinder", radius=0.07, length=0.2, margin=0.02, **POSE),
+    ConvexMesh(type="mesh", name="mesh", vertices=WEDGE, **POSE),
+]
+IDS = [o.name for o in SHAPES]
+
+
+def true_distance(o: Obstacle, p: Array) -> float:
+    """Distance of a point to the obstacle itself by Coal; negative where Coal sees a penetration."""
+    ball = coal.Sphere(1e-6)
+    pose = coal.Transform3s(o.rotation, np.array(o.xyz)) if hasattr(o, "xyz") else coal.Transform3s.Identity()
+    match o:
+        case Sphere():
+            solid, pose = coal.Sphere(o.radius), coal.Transform3s(np.eye(3), np.array(o.center))
+        case HalfSpace():
+            solid = coal.Halfspace(np.array(o.normal), o.offset)
+        case Box():
+            solid = coal.Box(*o.size)
+        case Capsule():
+            solid = coal.Capsule(o.radius, o.length)
+        case Cylinder():
+            solid = coal.Cylinder(o.radius, o.length)
+        case ConvexMesh():
+            points = coal.StdVec_Vec3s()
+            for x in o.vertices:
+                points.append(np.array(x))
+            solid = coal.Convex.convexHull(points, True, "Qt")
+    at = coal.Transform3s(np.eye(3), p)
+    return coal.distance(ball, at, solid, pose, coal.DistanceRequest(), coal.DistanceResult()) + 1e-6
+
+
+def around(o: Obstacle, count: int, reach: float, seed: int = 0) -> Array:
+    """Points (count, 3) in a cube about the obstacle."""
+    center = pack([o]).frames[0, :, 3]
+    return center + np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+
+
+@pytest.mark.parametrize("o", SHAPES, ids=IDS)
+def test_the_smoothed_distance_is_never_above_the_true_one_and_close_at_the_surface(o):
+    packed, gaps = pack([o]), []
+    for p in around(o, 4000, 0.3):
+        true, smooth = true_distance(o, p), packed.distance(0, p)
+        if true > 1e-4:
+            assert smooth <= true + 1e-5, p
+            assert smooth >= 0.8 * true - smoothing_gap(o) - 1e-5, p
+            if true < 0.003:
+                gaps.append(true - smooth)
+    assert len(gaps) > 2
+    if o.name != "mesh":  # beyond a mesh's sharp corners the supporting planes lie a little farther out
+        assert max(gaps) <= smoothing_gap(o) + 1e-4
+
+
+def test_gaps_stay_below_a_centimetre():
+    assert all(smoothing_gap(o) <= 0.0051 for o in SHAPES)
+    assert smoothing_gap(SHAPES[0]) == smoothing_gap(SHAPES[1]) == 0.0
+    assert smoothing_gap(SHAPES[2]) == pytest.approx(0.5 * (np.sqrt(3) - 1) * 0.01)
+    assert smoothing_gap(SHAPES[3]) == pytest.approx(0.5 * (np.sqrt(3) - 1) * 0.002)
+
+
+@pytest.mark.parametrize("o", SHAPES, ids=IDS)
+def test_margin_and_radius_are_taken_off(two_link, o):
+    body = [BodySphere(frame="tip", center=[0.0, 0.0, 0.0], radius=0.02)]
+    safety = SafetyFunction(two_link.model, body, [o], joint_limits=False)
+    q = np.array([0.2, -1.0])
+    p = safety.points.kinematics(two_link.model.evaluate(q, np.zeros(2))).p[0]
+    assert safety.least(q)[0] == pytest.approx(safety.packed.distance(0, p) - 0.02 - o.margin)
+
+
+@pytest.mark.parametrize("o", SHAPES, ids=IDS)
+def test_shapes_have_exact_first_and_second_order_terms(panda, states, along_motion, o):
+    model, rng, dt = panda.model, np.random.default_rng(1), 2e-5
+    safety = SafetyFunction(model, panda.robot.body[-3:], [o], joint_limits=False)
+    for q, v in states(panda, 30):
+        a = rng.normal(size=model.nv)
+        rows = safety.evaluate(model.evaluate(q, v))
+        before, after = (safety.evaluate(dyn) for dyn in along_motion(model, q, v, a, dt))
+        free = rows.h > -0.03
+        np.testing.assert_allclose((after.h - before.h)[free] / (2 * dt), (rows.grad @ v)[free], atol=1e-5)
+        rate = np.array([x.grad @ (v + s * dt * a) for x, s in ((after, 1), (before, -1))])
+        expected = (rate[0] - rate[1]) / (2 * dt)
+        np.testing.assert_allclose(expected[free], (rows.curvature + rows.grad @ a)[free], atol=2e-2, rtol=1e-3)
+
+
+def largest_jump(packed: Packed, p0: Array, w: Array, steps: int) -> float:
+    """Largest change of the second order term between neighbouring points outside the obstacle on a line."""
+    R, origin, n = packed.frames[0, :, :3], packed.frames[0, :, 3], np.zeros(3)
+    x0, along = R.T @ (p0 - origin), R.T @ w
+    points = x0 + np.linspace(0.0, 1.0, steps + 1)[:, None] * along
+    d, second = np.array([core(int(packed.kinds[0]), x, along, packed.sizes[0], packed.planes, n) for x in points]).T
+    outside = np.minimum(d[1:], d[:-1]) > 0.0
+    return float(np.abs(np.diff(second))[outside].max(initial=0.0))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("o", SHAPES[2:], ids=IDS[2:])
+def test_the_second_derivative_does_not_jump(o, seed):
+    """C²: with steps a quarter as long, the largest change of the second order term shrinks with them."""
+    packed = pack([o])
+    p0, p1 = around(o, 2, 0.25, seed)
+    coarse, fine = (largest_jump(packed, p0, p1 - p0, n) for n in (8_000, 32_000))
+    assert fine < 0.5 * coarse + 1e-3
+
+
+# Obstacles that move
+
+
+@pytest.mark.parametrize("o", SHAPES, ids=IDS)
+def test_motion_enters_with_first_and_second_order(panda, states, o):
+    """h along the motion of arm and obstacle together, by finite differences."""
+    model, rng, dt = panda.model, np.random.default_rng(2), 2e-5
+    safety = SafetyFunction(model, panda.robot.body[-3:], [o], joint_limits=False)
+    frame = safety.packed.frames[0]
+
+    def at(s, q, v, a, velocity, acceleration, omega):
+        """The rows and the arm's velocity at time s."""
+        turned = pin.exp3(omega * s) @ frame[:, :3]
+        origin = frame[:, 3] + s * velocity + 0.5 * s * s * acceleration
+        motion = Motion(origin, turned, velocity + s * acceleration, acceleration, omega)
+        dyn = model.evaluate(model.integrate(q, s * v + 0.5 * s * s * a), v + s * a)
+        return safety.evaluate(dyn, safety.packed.moved({o.name: motion})), dyn.v
+
+    for q, v in states(panda, 20):
+        a, *motion = (rng.normal(size=n) for n in (model.nv, 3, 3, 3))
+        (before, v0), (now, _), (after, v1) = (at(s, q, v, a, *motion) for s in (-dt, 0.0, dt))
+        free = now.h > -0.03
+        np.testing.assert_allclose((after.h - before.h)[free] / (2 * dt), now.hdot(v)[free], atol=1e-5)
+        expected = (after.hdot(v1) - before.hdot(v0)) / (2 * dt)
+        np.testing.assert_allclose(expected[free], (now.curvature + now.grad @ a)[free], atol=2e-2, rtol=1e-3)
+
+
+def test_motion_of_an_unknown_obstacle_and_nan_are_refused(panda):
+    with pytest.raises(InputError) as error:
+        panda.safety.packed.moved({"cat": Motion()})
+    assert str(error.value) == "no obstacle is named 'cat' (obstacles: ball)"
+    with pytest.raises(InputError) as error:
+        panda.safety.packed.moved({"ball": Motion(velocity=np.array([np.nan, 0, 0]))})
+    assert str(error.value) == "obstacle 'ball': its position and motion must be finite numbers"
+
+
+def test_moving_leaves_the_world_as_it_is(panda):
+    before = panda.safety.packed.frames.copy()
+    moved = panda.safety.packed.moved({"ball": Motion(xyz=np.array([1.0, 2.0, 3.0]))})
+    assert moved.frames[0, :, 3].tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(panda.safety.packed.frames, before)
+
+
+# Pairs of body spheres
+
+
+def test_self_collision_pairs_against_finite_differences(panda, states, along_motion):
+    model, dt = panda.model, 2e-5
+    body = panda.robot.body
+    safety = SafetyFunction(model, body, panda.safety.obstacles, joint_limits=False, self_pairs=[(0, 12), (1, 9)])
+    assert safety.pairs == len(body) + 2 and safety.names[-1] == "panda_link3#1 / panda_hand#9"
+    for q, v in states(panda, 10):
+        a = np.ones(model.nv)
+        dyn = model.evaluate(q, v)
+        rows = safety.evaluate(dyn)
+        p = safety.points.kinematics(dyn).p
+        assert rows.h[-1] == pytest.approx(np.linalg.norm(p[1] - p[9]) - body[1].radius - body[9].radius)
+        before, after = (safety.evaluate(x) for x in along_motion(model, q, v, a, dt))
+        np.testing.assert_allclose((after.h - before.h)[-2:] / (2 * dt), (rows.grad @ v)[-2:], atol=1e-5)
+        rate = (after.grad @ (v + dt * a) - before.grad @ (v - dt * a))[-2:] / (2 * dt)
+        np.testing.assert_allclose(rate, (rows.curvature + rows.grad @ a)[-2:], atol=1e-3)
+
+
+def test_a_domain_tighter_than_the_limits_gives_rows(two_link):
+    domain = np.array([[0.1, 1.0], [-9.0, 9.0]])
+    safety = SafetyFunction(two_link.model, two_link.robot.body, two_link.safety.obstacles, domain=domain)
+    h = dict(
+        zip(safety.names, safety.evaluate(two_link.model.evaluate(np.array([0.3, 0.2]), np.zeros(2))).h, strict=True)
+    )
+    name = two_link.model.joint_names[0]
+    assert h[f"{name} lower limit"] == pytest.approx(0.2) and h[f"{name} upper limit"] == pytest.approx(0.7)

@@ -89,8 +89,9 @@ class Field:
         v = s[:, None] * rays.d
         K, K_q_rate, K_v = self.K(params, rays.q, v)
         s2 = (s * s)[:, None]
+        hdot = (rays.grad @ v[..., None])[..., 0]
         return rho_rows(
-            rays.h, rays.grad, s2 * rays.eta, v, rays.Minv, rays.g + s2 * rays.beta, self.gamma, K, K_q_rate, K_v
+            rays.h, hdot, rays.grad, s2 * rays.eta, rays.Minv, rays.g + s2 * rays.beta, self.gamma, K, K_q_rate, K_v
         )
 
     @torch.no_grad()

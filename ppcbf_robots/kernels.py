@@ -1,0 +1,284 @@
+"""Compiled geometry: signed distances of body spheres to obstacles, with first and second order terms, in one pass.
+
+Every obstacle is given in a frame of its own, where ``core`` returns the distance of a point, its gradient and the
+second order term along a velocity. All shapes are C² where a body sphere can be, and never above the true distance:
+
+* A sphere and a half-space are exact.
+* A box, capsule or cylinder is the Euclidean norm of smoothed overshoots ``s(x)`` beyond a core that lies ``rho``
+  inside its faces. ``s`` is 0 up to the core, then ``rho (t³ - t⁴/2)`` with ``t = x / rho``, then ``x - rho / 2``: C²
+  and convex. At a flat face ``s = rho / 2``; ``sqrt(k) rho / 2`` is subtracted where k overshoots meet, so the rounded
+  corner contains the sharp one.
+* A convex mesh is the log-sum-exp of its supporting planes, shifted by ``log(m) / kappa`` below their largest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+SPHERE, HALF_SPACE, BOX, CAPSULE, CYLINDER, MESH = range(6)
+_TINY = 1e-9  # [m], below which the direction away from a centre is not defined
+_NEGLIGIBLE = -40.0  # exponent of a plane's weight below which it does not count
+
+
+def kernel(function: F) -> F:
+    """Compile with numba; the machine code is cached beside the source, or in the user's cache folder."""
+    return cast(F, numba.njit(cache=True)(function))
+
+
+@kernel
+def _ramp(x: float, rho: float) -> tuple[float, float, float]:
+    """Smoothed ``max(x, 0)`` and its first two derivatives."""
+    if x <= 0.0:
+        return 0.0, 0.0, 0.0
+    if x >= rho:
+        return x - 0.5 * rho, 1.0, 0.0
+    t = x / rho
+    return rho * t * t * t * (1.0 - 0.5 * t), t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) / rho
+
+
+@kernel
+def _box(x: Any, w: Any, size: Any, n: Any) -> tuple[float, float]:
+    """size: half edges and rho. Norm of three overshoots."""
+    rho = size[3]
+    d2 = 0.0
+    along = 0.0  # of n and w, times d
+    second = 0.0
+    for i in range(3):
+        s, s1, s2 = _ramp(abs(x[i]) - size[i] + rho, rho)
+        sign = 1.0 if x[i] >= 0.0 else -1.0
+        n[i] = s * s1 * sign
+        d2 += s * s
+        along += n[i] * w[i]
+        second += (s1 * s1 + s * s2) * w[i] * w[i]
+    d = max(math.sqrt(d2), _TINY)
+    for i in range(3):
+        n[i] /= d
+    return d - 0.5 * math.sqrt(3.0) * rho, (second - (along / d) ** 2) / d
+
+
+@kernel
+def _capsule(x: Any, w: Any, size: Any, n: Any) -> tuple[float, float]:
+    """size: radius, half length of the segment along z, rho."""
+    s, s1, s2 = _ramp(abs(x[2]) - size[1], size[2])
+    sign = 1.0 if x[2] >= 0.0 else -1.0
+    d = max(math.sqrt(x[0] * x[0] + x[1] * x[1] + s * s), _TINY)
+    n[0], n[1], n[2] = x[0] / d, x[1] / d, s * s1 * sign / d
+    along = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+    second = w[0] * w[0] + w[1] * w[1] + (s1 * s1 + s * s2) * w[2] * w[2]
+    return d - size[0], (second - along * along) / d
+
+
+@kernel
+def _cylinder(x: Any, w: Any, size: Any, n: Any) -> tuple[float, float]:
+    """size: radius, half length along z, rho. Norm of the radial and the axial overshoot."""
+    rho = size[2]
+    r = max(math.sqrt(x[0] * x[0] + x[1] * x[1]), _TINY)
+    s, s1, s2 = _ramp(r - size[0] + rho, rho)
+    z, z1, z2 = _ramp(abs(x[2]) - size[1] + rho, rho)
+    sign = 1.0 if x[2] >= 0.0 else -1.0
+    d = max(math.sqrt(s * s + z * z), _TINY)
+    along_r, along_z = s * s1 / d, z * z1 * sign / d
+    n[0], n[1], n[2] = along_r * x[0] / r, along_r * x[1] / r, along_z
+    w_r = (x[0] * w[0] + x[1] * w[1]) / r
+    around = max(w[0] * w[0] + w[1] * w[1] - w_r * w_r, 0.0)
+    along = along_r * w_r + along_z * w[2]
+    second = (s1 * s1 + s * s2) * w_r * w_r + (z1 * z1 + z * z2) * w[2] * w[2]
+    return d - 0.5 * math.sqrt(2.0) * rho, (second - along * along) / d + along_r / r * around
+
+
+@kernel
+def _mesh(x: Any, w: Any, planes: Any, kappa: float, n: Any) -> tuple[float, float]:
+    """planes (m, 4): outward unit normal and offset. Smooth maximum, shifted below the largest plane distance."""
+    m = len(planes)
+    largest = -1e300
+    for k in range(m):
+        value = planes[k, 0] * x[0] + planes[k, 1] * x[1] + planes[k, 2] * x[2] - planes[k, 3]
+        largest = max(largest, value)
+    total = along = square = 0.0
+    n[0] = n[1] = n[2] = 0.0
+    for k in range(m):
+        value = planes[k, 0] * x[0] + planes[k, 1] * x[1] + planes[k, 2] * x[2] - planes[k, 3]
+        exponent = kappa * (value - largest)
+        if exponent > _NEGLIGIBLE:
+            weight = math.exp(exponent)
+            speed = planes[k, 0] * w[0] + planes[k, 1] * w[1] + planes[k, 2] * w[2]
+            total += weight
+            along += weight * speed
+            square += weight * speed * speed
+            for i in range(3):
+                n[i] += weight * planes[k, i]
+    for i in range(3):
+        n[i] /= total
+    along /= total
+    return largest + (math.log(total) - math.log(m)) / kappa, kappa * (square / total - along * along)
+
+
+@kernel
+def core(kind: int, x: Any, w: Any, size: Any, planes: Any, n: Any) -> tuple[float, float]:
+    """Distance [m] of point x to an obstacle and the second order term ``wᵀ H w``, in the obstacle's frame.
+
+    Args:
+        kind: SPHERE to MESH.
+        x: point (3,) [m].
+        w: velocity of the point (3,) [m/s].
+        size: (4,) see each shape; sphere: radius; mesh: kappa [1/m].
+        planes: (m, 4) of a mesh, else anything.
+        n: (3,) receives the gradient.
+    """
+    if kind == HALF_SPACE:
+        n[0], n[1], n[2] = 0.0, 0.0, 1.0
+        return x[2], 0.0
+    if kind == BOX:
+        return _box(x, w, size, n)
+    if kind == CAPSULE:
+        return _capsule(x, w, size, n)
+    if kind == CYLINDER:
+        return _cylinder(x, w, size, n)
+    if kind == MESH:
+        return _mesh(x, w, planes, size[0], n)
+    d = max(math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), _TINY)
+    along = 0.0
+    for i in range(3):
+        n[i] = x[i] / d
+        along += n[i] * w[i]
+    return d - size[0], (w[0] * w[0] + w[1] * w[1] + w[2] * w[2] - along * along) / d
+
+
+@kernel
+def point_kinematics(
+    placements: Any, J: Any, dJ: Any, v: Any, joints: Any, offsets: Any, mask: Any, p: Any, Jp: Any, vel: Any, acc: Any
+) -> None:
+    """Body points at one state: p (P, 3), Jp (P, 3, nv), vel = Jp v (P, 3) and acc = J̇p v (P, 3) are filled in.
+
+    placements (joints, 4, 4); J, dJ (6, nv) spatial in the base frame at its origin, rows (linear, angular).
+    """
+    nv = len(v)
+    for i in range(len(joints)):
+        T = placements[joints[i]]
+        for r in range(3):
+            p[i, r] = T[r, 0] * offsets[i, 0] + T[r, 1] * offsets[i, 1] + T[r, 2] * offsets[i, 2] + T[r, 3]
+            vel[i, r] = 0.0
+            acc[i, r] = 0.0
+        x, y, z = p[i, 0], p[i, 1], p[i, 2]
+        wx = wy = wz = 0.0
+        for j in range(nv):
+            if not mask[i, j]:
+                Jp[i, 0, j] = Jp[i, 1, j] = Jp[i, 2, j] = 0.0
+                continue
+            a, b, c = J[3, j], J[4, j], J[5, j]
+            Jp[i, 0, j] = J[0, j] + b * z - c * y
+            Jp[i, 1, j] = J[1, j] + c * x - a * z
+            Jp[i, 2, j] = J[2, j] + a * y - b * x
+            wx, wy, wz = wx + a * v[j], wy + b * v[j], wz + c * v[j]
+            a, b, c = dJ[3, j], dJ[4, j], dJ[5, j]
+            acc[i, 0] += (dJ[0, j] + b * z - c * y) * v[j]
+            acc[i, 1] += (dJ[1, j] + c * x - a * z) * v[j]
+            acc[i, 2] += (dJ[2, j] + a * y - b * x) * v[j]
+            for r in range(3):
+                vel[i, r] += Jp[i, r, j] * v[j]
+        acc[i, 0] += wy * vel[i, 2] - wz * vel[i, 1]
+        acc[i, 1] += wz * vel[i, 0] - wx * vel[i, 2]
+        acc[i, 2] += wx * vel[i, 1] - wy * vel[i, 0]
+
+
+@kernel
+def points_at(placements: Any, J: Any, dJ: Any, v: Any, joints: Any, offsets: Any, mask: Any, p: Any, Jp: Any,
+              acc: Any) -> None:  # fmt: skip
+    """:func:`point_kinematics` for a batch: every state's array carries a leading axis."""
+    vel = np.empty((len(joints), 3))
+    for s in range(len(v)):
+        point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p[s], Jp[s], vel, acc[s])
+
+
+@kernel
+def _obstacle_row(
+    p: Any, vel: Any, acc: Any, kind: int, size: Any, planes: Any, frame: Any, motion: Any, n: Any, work: Any
+) -> tuple[float, float, float]:
+    """Distance, ∂h/∂t and ḧ without ``∇h a`` of one body point and one obstacle; n receives ∇h in the base frame.
+
+    frame (3, 4): rotation and origin; motion (3, 3): rows are the origin's velocity and acceleration and the angular
+    velocity (constant), all in the base frame.
+    """
+    x, w, local = work[0], work[1], work[2]
+    ox, oy, oz = motion[2, 0], motion[2, 1], motion[2, 2]
+    rx, ry, rz = p[0] - frame[0, 3], p[1] - frame[1, 3], p[2] - frame[2, 3]
+    tx, ty, tz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx  # ω x r
+    sx, sy, sz = motion[0, 0] + tx, motion[0, 1] + ty, motion[0, 2] + tz  # the obstacle's velocity at p
+    ux, uy, uz = vel[0] - sx, vel[1] - sy, vel[2] - sz  # relative to it
+    for i in range(3):
+        x[i] = frame[0, i] * rx + frame[1, i] * ry + frame[2, i] * rz
+        w[i] = frame[0, i] * ux + frame[1, i] * uy + frame[2, i] * uz
+    d, second = core(kind, x, w, size, planes, local)
+    for i in range(3):
+        n[i] = frame[i, 0] * local[0] + frame[i, 1] * local[1] + frame[i, 2] * local[2]
+    # p̈ seen from the turning obstacle: minus a_o, minus ω x (ω x r), minus 2 ω x u
+    gx = acc[0] - motion[1, 0] - (oy * tz - oz * ty) - 2.0 * (oy * uz - oz * uy)
+    gy = acc[1] - motion[1, 1] - (oz * tx - ox * tz) - 2.0 * (oz * ux - ox * uz)
+    gz = acc[2] - motion[1, 2] - (ox * ty - oy * tx) - 2.0 * (ox * uy - oy * ux)
+    drift = -(n[0] * sx + n[1] * sy + n[2] * sz)
+    return d, drift, second + n[0] * gx + n[1] * gy + n[2] * gz
+
+
+@kernel
+def rows_at(
+    placements: Any, J: Any, dJ: Any, v: Any, angles: Any, joints: Any, offsets: Any, mask: Any, radii: Any,
+    kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any, frames: Any, motions: Any,
+    self_pairs: Any, limit_joint: Any, limit_sign: Any, limit_bound: Any,
+    h: Any, grad: Any, drift: Any, curvature: Any,
+) -> None:  # fmt: skip
+    """All rows at a batch of states: body points by obstacles (obstacle fastest), self-collision pairs, joint limits.
+
+    Inputs of one state as in :func:`point_kinematics` with a leading batch axis; outputs h, drift, curvature (B, rows)
+    and grad (B, rows, nv). Obstacles as packed by :class:`ppcbf_robots.shapes.Packed`.
+    """
+    P, O, nv = len(joints), len(kinds), v.shape[1]
+    p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
+    Jp, n, work = np.empty((P, 3, nv)), np.empty(3), np.empty((3, 3))
+    for s in range(len(v)):
+        point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
+        row = 0
+        for i in range(P):
+            for o in range(O):
+                part = planes[plane_start[o] : plane_start[o + 1]]
+                d, h_t, second = _obstacle_row(
+                    p[i], vel[i], acc[i], kinds[o], sizes[o], part, frames[o], motions[o], n, work
+                )
+                h[s, row] = d - radii[i] - margins[o]
+                drift[s, row], curvature[s, row] = h_t, second
+                for j in range(nv):
+                    grad[s, row, j] = n[0] * Jp[i, 0, j] + n[1] * Jp[i, 1, j] + n[2] * Jp[i, 2, j]
+                row += 1
+        for k in range(len(self_pairs)):
+            a, b = self_pairs[k, 0], self_pairs[k, 1]
+            square = along = speed = push = 0.0
+            for r in range(3):
+                n[r] = p[a, r] - p[b, r]
+                square += n[r] * n[r]
+            d = max(math.sqrt(square), _TINY)
+            for r in range(3):
+                n[r] /= d
+                w = vel[a, r] - vel[b, r]
+                along += n[r] * w
+                speed += w * w
+                push += n[r] * (acc[a, r] - acc[b, r])
+            h[s, row] = d - radii[a] - radii[b]
+            drift[s, row], curvature[s, row] = 0.0, push + (speed - along * along) / d
+            for j in range(nv):
+                grad[s, row, j] = 0.0
+                for r in range(3):
+                    grad[s, row, j] += n[r] * (Jp[a, r, j] - Jp[b, r, j])
+            row += 1
+        for k in range(len(limit_joint)):
+            j = limit_joint[k]
+            h[s, row] = limit_sign[k] * (angles[s, j] - limit_bound[k])
+            drift[s, row] = curvature[s, row] = 0.0
+            grad[s, row, :] = 0.0
+            grad[s, row, j] = limit_sign[k]
+            row += 1
