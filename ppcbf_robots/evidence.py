@@ -13,7 +13,7 @@ from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array
 
 CHUNK = 1000
-POWER_TOLERANCE = 1e-3  # of u_max · v_max
+POWER_TOLERANCE = 5e-4  # of u_max · v_max; with 1e-3 the cart-pole's storage crept up by 2e-3 of itself
 VELOCITIES = 20  # tried per configuration
 
 
@@ -102,7 +102,7 @@ def check_band(
 ) -> BandCheck:
     """Run the filter on uniform band states with the problem's controller and count violations.
 
-    Closed form: a violation is a torque above u_max, or (if ``passive``) ``vᵀ u_sc`` above d_p by more than 1e-3 of the
+    Closed form: a violation is a torque above u_max, or (if ``passive``) ``vᵀ u_sc`` above d_p by more than 5e-4 of the
     largest power u_max · v_max: near rest the paper's condition cannot hold exactly. QP: no torque in the box satisfies
     all rows with the passivity row (without it if not ``passive``).
     """

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
+from ppcbf_robots.condense import condense
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics
@@ -82,6 +83,24 @@ class Correction:
     row: int  # index of the row that decided, -1 if none
 
 
+@dataclass(frozen=True)
+class QPRows:
+    """All rows ``C z >= lower`` of the dimensionless correction; the barrier's first, then the velocity domain's."""
+
+    C: Array  # (rows, nv), of length 1
+    lower: Array  # (rows,)
+    norm: Array  # (rows,) length before, in units of phi̇ per full torque
+    binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
+    barrier_rows: int
+
+    def nearest(self, count: int) -> NDArray[np.int64]:
+        """Indices of the rows most in need of a correction, rising; at least one."""
+        found = np.flatnonzero(self.binding)
+        if len(found) > count:
+            found = np.sort(found[np.argsort(-self.lower[found], kind="stable")[:count]])
+        return found if len(found) else np.zeros(1, dtype=np.int64)
+
+
 class ClosedForm:
     """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
 
@@ -146,59 +165,55 @@ class ClosedForm:
 class QPFilter:
     """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
 
-    Rows are ``psi_k(u) >= -alpha (phi_k - margin)`` (PP-CBF: alpha = gamma_K, no margin) and ``vᵀ δ <= d_p``. The near
-    rows are those closest to violation by u_des, each in units of the correction it needs; the others are checked
-    afterwards and join if they are violated, so the answer satisfies all rows.
+    Rows are ``psi_k(u) >= -alpha (phi_k - margin)`` (PP-CBF: alpha = gamma_K, no margin), the velocity domain's, and
+    ``vᵀ δ <= d_p``. The near rows are those closest to violation by u_des, each in units of the correction it needs;
+    the others are checked afterwards and join if they are violated, so the answer satisfies all rows.
     """
 
     def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
         self.barrier, self.safety, self.config = barrier, safety, config
         self.solver: QPSolver = make_solver(config.solver)
 
-    def _slack(self, rows: BarrierRows, u_des: Array) -> Array:
-        """Left side of every row at δ = 0; the row holds there if it is >= 0."""
-        if self.barrier.kind == "pp-cbf":
-            return np.asarray(rows.psi(u_des) + self.barrier.spec.gamma_K * rows.phi)
-        return np.asarray(rows.psi(u_des) + self.config.alpha * (rows.phi - self.config.margin))
+    def _condense(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[QPRows, int, bool]:
+        energy = self.barrier.kind == "pp-cbf"
+        alpha = self.barrier.spec.gamma_K if energy else self.config.alpha
+        count, nv = len(rows.phi) + 2 * len(self.safety.v_domain), len(u_max)
+        C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
+        binding = np.empty(count, dtype=np.bool_)
+        hopeless, hold = condense(
+            rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
+        )  # fmt: skip
+        return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold
 
     def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
         """The least correction in the configured metric, checked before it is returned."""
-        slack = self._slack(rows, u_des)
-        inside = bool(np.all(np.abs(u_des) <= u_max))
-        if inside and np.all(slack >= 0.0):
+        qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max)
+        if hold and np.all(np.abs(u_des) <= u_max):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
-        C = rows.Lg_phi * u_max
-        norms = np.sqrt(np.einsum("ij,ij->i", C, C))
-        scale = np.maximum(norms, _FLAT)
-        C, lower = C / scale[:, None], -slack / scale
         box = (-1.0 - u_des / u_max, 1.0 - u_des / u_max)
-        center, reach = C @ (-u_des / u_max), np.abs(C).sum(-1)  # C z lies in center ± reach
-        binding = lower > center - reach  # the others hold for every torque in the box
-        hopeless = lower > center + reach + ROW_TOLERANCE  # no torque in the box satisfies them
-        if hopeless.any():
-            k = int(np.argmax(np.where(hopeless, lower, -np.inf)))
-            flat = norms[k] < _FLAT
+        if hopeless >= 0:
+            flat = qp.norm[hopeless] < _FLAT
             reason = "L_g phi is zero on a violated row" if flat else "a row is out of reach of the torque box"
-            steerable = binding & (norms >= _FLAT)
-            z = self._least_violation(dyn, C[steerable], lower[steerable], box, u_max)
-            return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, k)
+            z = self._least_violation(dyn, qp, box, u_max)
+            return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, hopeless)
         passivity = self._passivity_row(dyn, d_p, u_max)
-        z = self._solve(dyn, C, lower, binding, passivity, box, u_max)
+        z = self._solve(dyn, qp, passivity, box, u_max)
         if z is not None:
-            k = self._tightest(C, lower, z)
+            k = self._tightest(qp, z)
             return self._answer(z, u_des, u_max, Status.CORRECTING, "constraint active", k)
         if passivity is not None:
-            z = self._solve(dyn, C, lower, binding, None, box, u_max)
+            z = self._solve(dyn, qp, None, box, u_max)
         if z is not None:
-            k = self._tightest(C, lower, z)
+            k = self._tightest(qp, z)
             return self._answer(z, u_des, u_max, Status.PASSIVITY_DROPPED, "rows and box allow no passive torque", k)
-        z = self._least_violation(dyn, C[binding], lower[binding], box, u_max)
-        k = int(np.argmax(lower))
+        z = self._least_violation(dyn, qp, box, u_max)
+        k = int(np.argmax(qp.lower[: qp.barrier_rows]))
         return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
 
     @staticmethod
-    def _tightest(C: Array, lower: Array, z: Array) -> int:
-        residual = C @ z - lower
+    def _tightest(qp: QPRows, z: Array) -> int:
+        residual = qp.C @ z - qp.lower
         k = int(np.argmin(residual))
         return k if residual[k] < 1e-4 else -1
 
@@ -218,41 +233,36 @@ class QPFilter:
         H = np.diag(u_max**2) if self.config.metric == "torque" else dyn.Minv * u_max * u_max[:, None]
         return np.asarray(H * (len(u_max) / H.trace()))
 
-    def _solve(
-        self,
-        dyn: Dynamics,
-        C: Array,
-        lower: Array,
-        binding: NDArray[np.bool_],
-        passivity: Row | None,
-        box: Box,
-        u_max: Array,
-    ) -> Array | None:
+    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, box: Box, u_max: Array) -> Array | None:
         """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
         H = self._hessian(dyn, u_max)
-        ranked = np.argsort(np.where(binding, -lower, np.inf), kind="stable")
-        chosen = np.sort(ranked[: max(1, min(self.config.near_rows, int(binding.sum())))])
-        slack_of = ROW_TOLERANCE * np.maximum(1.0, np.abs(lower))
+        chosen = qp.nearest(self.config.near_rows)
+        slack_of = ROW_TOLERANCE * np.maximum(1.0, np.abs(qp.lower))
         for _ in range(4):
-            rows, bounds, allowed = C[chosen], lower[chosen], slack_of[chosen]
+            rows, bounds, allowed = qp.C[chosen], qp.lower[chosen], slack_of[chosen]
             if passivity is not None:
                 rows, bounds = np.vstack([rows, passivity[0]]), np.append(bounds, passivity[1])
                 allowed = np.append(allowed, ROW_TOLERANCE)
             z = self._ask(QPProblem(H, np.zeros(len(H)), rows, bounds, *box))
             if z is None:
                 return None
-            z = np.clip(z, *box)
+            z = np.minimum(np.maximum(z, box[0]), box[1])
             if np.any(rows @ z < bounds - allowed):
                 return None
-            missed = np.flatnonzero(binding & (C @ z < lower - slack_of))
+            missed = np.flatnonzero(qp.binding & (qp.C @ z < qp.lower - slack_of))
             if not missed.size:
                 return z
             chosen = np.union1d(chosen, missed)
         return None
 
-    def _least_violation(self, dyn: Dynamics, C: Array, lower: Array, box: Box, u_max: Array) -> Array | None:
-        """Torque in the box with the least worst violation: one slack shared by all rows, heavily weighted."""
+    def _least_violation(self, dyn: Dynamics, qp: QPRows, box: Box, u_max: Array) -> Array | None:
+        """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted.
+
+        The velocity domain is given up here: leaving it is better than an obstacle.
+        """
         n = len(u_max)
+        steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
+        C, lower = qp.C[steerable], qp.lower[steerable]
         reach = np.maximum(C * box[0], C * box[1]).sum(-1)
         lower = np.minimum(lower, reach)  # each row falls short by what is out of its own reach in any case
         near = np.sort(np.argsort(-lower, kind="stable")[: self.config.near_rows])

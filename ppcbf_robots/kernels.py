@@ -21,6 +21,8 @@ import numba
 import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
+Vector = tuple[float, float, float]
+Core = tuple[float, float, float, float, float]  # distance, second order term, gradient
 
 SPHERE, HALF_SPACE, BOX, CAPSULE, CYLINDER, MESH = range(6)
 _TINY = 1e-9  # [m], below which the direction away from a centre is not defined
@@ -29,7 +31,7 @@ _NEGLIGIBLE = -40.0  # exponent of a plane's weight below which it does not coun
 
 def kernel(function: F) -> F:
     """Compile with numba; the machine code is cached beside the source, or in the user's cache folder."""
-    return cast(F, numba.njit(cache=True)(function))
+    return cast(F, numba.njit(cache=True, error_model="numpy")(function))
 
 
 @kernel
@@ -44,111 +46,99 @@ def _ramp(x: float, rho: float) -> tuple[float, float, float]:
 
 
 @kernel
-def _box(x: Any, w: Any, size: Any, n: Any) -> tuple[float, float]:
+def _box(x: Vector, w: Vector, size: Any) -> Core:
     """size: half edges and rho. Norm of three overshoots."""
     rho = size[3]
-    d2 = 0.0
-    along = 0.0  # of n and w, times d
-    second = 0.0
-    for i in range(3):
-        s, s1, s2 = _ramp(abs(x[i]) - size[i] + rho, rho)
-        sign = 1.0 if x[i] >= 0.0 else -1.0
-        n[i] = s * s1 * sign
-        d2 += s * s
-        along += n[i] * w[i]
-        second += (s1 * s1 + s * s2) * w[i] * w[i]
-    d = max(math.sqrt(d2), _TINY)
-    for i in range(3):
-        n[i] /= d
-    return d - 0.5 * math.sqrt(3.0) * rho, (second - (along / d) ** 2) / d
+    sx, sx1, sx2 = _ramp(abs(x[0]) - size[0] + rho, rho)
+    sy, sy1, sy2 = _ramp(abs(x[1]) - size[1] + rho, rho)
+    sz, sz1, sz2 = _ramp(abs(x[2]) - size[2] + rho, rho)
+    d = max(math.sqrt(sx * sx + sy * sy + sz * sz), _TINY)
+    n0, n1 = math.copysign(sx * sx1, x[0]) / d, math.copysign(sy * sy1, x[1]) / d
+    n2 = math.copysign(sz * sz1, x[2]) / d
+    second = (
+        (sx1 * sx1 + sx * sx2) * w[0] ** 2 + (sy1 * sy1 + sy * sy2) * w[1] ** 2 + (sz1 * sz1 + sz * sz2) * w[2] ** 2
+    )
+    along = n0 * w[0] + n1 * w[1] + n2 * w[2]
+    return d - 0.5 * math.sqrt(3.0) * rho, (second - along * along) / d, n0, n1, n2
 
 
 @kernel
-def _capsule(x: Any, w: Any, size: Any, n: Any) -> tuple[float, float]:
+def _capsule(x: Vector, w: Vector, size: Any) -> Core:
     """size: radius, half length of the segment along z, rho."""
     s, s1, s2 = _ramp(abs(x[2]) - size[1], size[2])
-    sign = 1.0 if x[2] >= 0.0 else -1.0
     d = max(math.sqrt(x[0] * x[0] + x[1] * x[1] + s * s), _TINY)
-    n[0], n[1], n[2] = x[0] / d, x[1] / d, s * s1 * sign / d
-    along = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+    n0, n1, n2 = x[0] / d, x[1] / d, math.copysign(s * s1, x[2]) / d
+    along = n0 * w[0] + n1 * w[1] + n2 * w[2]
     second = w[0] * w[0] + w[1] * w[1] + (s1 * s1 + s * s2) * w[2] * w[2]
-    return d - size[0], (second - along * along) / d
+    return d - size[0], (second - along * along) / d, n0, n1, n2
 
 
 @kernel
-def _cylinder(x: Any, w: Any, size: Any, n: Any) -> tuple[float, float]:
+def _cylinder(x: Vector, w: Vector, size: Any) -> Core:
     """size: radius, half length along z, rho. Norm of the radial and the axial overshoot."""
     rho = size[2]
     r = max(math.sqrt(x[0] * x[0] + x[1] * x[1]), _TINY)
     s, s1, s2 = _ramp(r - size[0] + rho, rho)
     z, z1, z2 = _ramp(abs(x[2]) - size[1] + rho, rho)
-    sign = 1.0 if x[2] >= 0.0 else -1.0
     d = max(math.sqrt(s * s + z * z), _TINY)
-    along_r, along_z = s * s1 / d, z * z1 * sign / d
-    n[0], n[1], n[2] = along_r * x[0] / r, along_r * x[1] / r, along_z
+    n_r, n_z = s * s1 / d, math.copysign(z * z1, x[2]) / d
     w_r = (x[0] * w[0] + x[1] * w[1]) / r
     around = max(w[0] * w[0] + w[1] * w[1] - w_r * w_r, 0.0)
-    along = along_r * w_r + along_z * w[2]
+    along = n_r * w_r + n_z * w[2]
     second = (s1 * s1 + s * s2) * w_r * w_r + (z1 * z1 + z * z2) * w[2] * w[2]
-    return d - 0.5 * math.sqrt(2.0) * rho, (second - along * along) / d + along_r / r * around
+    second = (second - along * along) / d + n_r / r * around
+    return d - 0.5 * math.sqrt(2.0) * rho, second, n_r * x[0] / r, n_r * x[1] / r, n_z
 
 
 @kernel
-def _mesh(x: Any, w: Any, planes: Any, kappa: float, n: Any) -> tuple[float, float]:
-    """planes (m, 4): outward unit normal and offset. Smooth maximum, shifted below the largest plane distance."""
-    m = len(planes)
+def _mesh(x: Vector, w: Vector, kappa: float, planes: Any, first: int, end: int) -> Core:
+    """planes (:, 4): outward unit normal and offset. Smooth maximum, shifted below the largest plane distance."""
     largest = -1e300
-    for k in range(m):
-        value = planes[k, 0] * x[0] + planes[k, 1] * x[1] + planes[k, 2] * x[2] - planes[k, 3]
-        largest = max(largest, value)
-    total = along = square = 0.0
-    n[0] = n[1] = n[2] = 0.0
-    for k in range(m):
-        value = planes[k, 0] * x[0] + planes[k, 1] * x[1] + planes[k, 2] * x[2] - planes[k, 3]
-        exponent = kappa * (value - largest)
+    for k in range(first, end):
+        largest = max(largest, planes[k, 0] * x[0] + planes[k, 1] * x[1] + planes[k, 2] * x[2] - planes[k, 3])
+    total = along = square = n0 = n1 = n2 = 0.0
+    for k in range(first, end):
+        a0, a1, a2 = planes[k, 0], planes[k, 1], planes[k, 2]
+        exponent = kappa * (a0 * x[0] + a1 * x[1] + a2 * x[2] - planes[k, 3] - largest)
         if exponent > _NEGLIGIBLE:
             weight = math.exp(exponent)
-            speed = planes[k, 0] * w[0] + planes[k, 1] * w[1] + planes[k, 2] * w[2]
+            speed = a0 * w[0] + a1 * w[1] + a2 * w[2]
             total += weight
             along += weight * speed
             square += weight * speed * speed
-            for i in range(3):
-                n[i] += weight * planes[k, i]
-    for i in range(3):
-        n[i] /= total
+            n0, n1, n2 = n0 + weight * a0, n1 + weight * a1, n2 + weight * a2
     along /= total
-    return largest + (math.log(total) - math.log(m)) / kappa, kappa * (square / total - along * along)
+    d = largest + (math.log(total) - math.log(end - first)) / kappa
+    return d, kappa * (square / total - along * along), n0 / total, n1 / total, n2 / total
 
 
 @kernel
-def core(kind: int, x: Any, w: Any, size: Any, planes: Any, n: Any) -> tuple[float, float]:
-    """Distance [m] of point x to an obstacle and the second order term ``wᵀ H w``, in the obstacle's frame.
+def core(kind: int, x: Vector, w: Vector, size: Any, planes: Any, first: int, end: int) -> Core:
+    """Distance [m] of a point to an obstacle, second order term ``wᵀ H w`` and gradient, in the obstacle's frame.
 
     Args:
         kind: SPHERE to MESH.
-        x: point (3,) [m].
-        w: velocity of the point (3,) [m/s].
+        x: the point [m].
+        w: its velocity [m/s].
         size: (4,) see each shape; sphere: radius; mesh: kappa [1/m].
-        planes: (m, 4) of a mesh, else anything.
-        n: (3,) receives the gradient.
+        planes: supporting planes of all meshes (:, 4), of which ``first`` to ``end`` are this one's.
+        first: see planes.
+        end: see planes.
     """
     if kind == HALF_SPACE:
-        n[0], n[1], n[2] = 0.0, 0.0, 1.0
-        return x[2], 0.0
+        return x[2], 0.0, 0.0, 0.0, 1.0
     if kind == BOX:
-        return _box(x, w, size, n)
+        return _box(x, w, size)
     if kind == CAPSULE:
-        return _capsule(x, w, size, n)
+        return _capsule(x, w, size)
     if kind == CYLINDER:
-        return _cylinder(x, w, size, n)
+        return _cylinder(x, w, size)
     if kind == MESH:
-        return _mesh(x, w, planes, size[0], n)
+        return _mesh(x, w, size[0], planes, first, end)
     d = max(math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), _TINY)
-    along = 0.0
-    for i in range(3):
-        n[i] = x[i] / d
-        along += n[i] * w[i]
-    return d - size[0], (w[0] * w[0] + w[1] * w[1] + w[2] * w[2] - along * along) / d
+    n0, n1, n2 = x[0] / d, x[1] / d, x[2] / d
+    along = n0 * w[0] + n1 * w[1] + n2 * w[2]
+    return d - size[0], (w[0] * w[0] + w[1] * w[1] + w[2] * w[2] - along * along) / d, n0, n1, n2
 
 
 @kernel
@@ -199,31 +189,32 @@ def points_at(placements: Any, J: Any, dJ: Any, v: Any, joints: Any, offsets: An
 
 @kernel
 def _obstacle_row(
-    p: Any, vel: Any, acc: Any, kind: int, size: Any, planes: Any, frame: Any, motion: Any, n: Any, work: Any
-) -> tuple[float, float, float]:
-    """Distance, ∂h/∂t and ḧ without ``∇h a`` of one body point and one obstacle; n receives ∇h in the base frame.
+    p: Vector, vel: Vector, acc: Vector, kind: int, size: Any, planes: Any, first: int, end: int, f: Any, motion: Any
+) -> tuple[float, float, float, float, float, float]:
+    """h, ∂h/∂t, ḧ without ``∇h a``, and ∇h in the base frame, of one body point and one obstacle.
 
-    frame (3, 4): rotation and origin; motion (3, 3): rows are the origin's velocity and acceleration and the angular
+    f (3, 4): rotation and origin; motion (3, 3): rows are the origin's velocity and acceleration and the angular
     velocity (constant), all in the base frame.
     """
-    x, w, local = work[0], work[1], work[2]
     ox, oy, oz = motion[2, 0], motion[2, 1], motion[2, 2]
-    rx, ry, rz = p[0] - frame[0, 3], p[1] - frame[1, 3], p[2] - frame[2, 3]
+    rx, ry, rz = p[0] - f[0, 3], p[1] - f[1, 3], p[2] - f[2, 3]
     tx, ty, tz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx  # ω x r
     sx, sy, sz = motion[0, 0] + tx, motion[0, 1] + ty, motion[0, 2] + tz  # the obstacle's velocity at p
     ux, uy, uz = vel[0] - sx, vel[1] - sy, vel[2] - sz  # relative to it
-    for i in range(3):
-        x[i] = frame[0, i] * rx + frame[1, i] * ry + frame[2, i] * rz
-        w[i] = frame[0, i] * ux + frame[1, i] * uy + frame[2, i] * uz
-    d, second = core(kind, x, w, size, planes, local)
-    for i in range(3):
-        n[i] = frame[i, 0] * local[0] + frame[i, 1] * local[1] + frame[i, 2] * local[2]
+    x = (f[0, 0] * rx + f[1, 0] * ry + f[2, 0] * rz, f[0, 1] * rx + f[1, 1] * ry + f[2, 1] * rz,
+         f[0, 2] * rx + f[1, 2] * ry + f[2, 2] * rz)  # fmt: skip
+    w = (f[0, 0] * ux + f[1, 0] * uy + f[2, 0] * uz, f[0, 1] * ux + f[1, 1] * uy + f[2, 1] * uz,
+         f[0, 2] * ux + f[1, 2] * uy + f[2, 2] * uz)  # fmt: skip
+    d, second, a0, a1, a2 = core(kind, x, w, size, planes, first, end)
+    n0 = f[0, 0] * a0 + f[0, 1] * a1 + f[0, 2] * a2
+    n1 = f[1, 0] * a0 + f[1, 1] * a1 + f[1, 2] * a2
+    n2 = f[2, 0] * a0 + f[2, 1] * a1 + f[2, 2] * a2
     # p̈ seen from the turning obstacle: minus a_o, minus ω x (ω x r), minus 2 ω x u
     gx = acc[0] - motion[1, 0] - (oy * tz - oz * ty) - 2.0 * (oy * uz - oz * uy)
     gy = acc[1] - motion[1, 1] - (oz * tx - ox * tz) - 2.0 * (oz * ux - ox * uz)
     gz = acc[2] - motion[1, 2] - (ox * ty - oy * tx) - 2.0 * (ox * uy - oy * ux)
-    drift = -(n[0] * sx + n[1] * sy + n[2] * sz)
-    return d, drift, second + n[0] * gx + n[1] * gy + n[2] * gz
+    drift = -(n0 * sx + n1 * sy + n2 * sz)
+    return d, drift, second + n0 * gx + n1 * gy + n2 * gz, n0, n1, n2
 
 
 @kernel
@@ -240,20 +231,22 @@ def rows_at(
     """
     P, O, nv = len(joints), len(kinds), v.shape[1]
     p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
-    Jp, n, work = np.empty((P, 3, nv)), np.empty(3), np.empty((3, 3))
+    Jp, n = np.empty((P, 3, nv)), np.empty(3)
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
         row = 0
         for i in range(P):
+            at = (p[i, 0], p[i, 1], p[i, 2])
+            moves, turns = (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2])
             for o in range(O):
-                part = planes[plane_start[o] : plane_start[o + 1]]
-                d, h_t, second = _obstacle_row(
-                    p[i], vel[i], acc[i], kinds[o], sizes[o], part, frames[o], motions[o], n, work
-                )
+                d, h_t, second, n0, n1, n2 = _obstacle_row(
+                    at, moves, turns, kinds[o], sizes[o], planes, plane_start[o], plane_start[o + 1], frames[o],
+                    motions[o],
+                )  # fmt: skip
                 h[s, row] = d - radii[i] - margins[o]
                 drift[s, row], curvature[s, row] = h_t, second
                 for j in range(nv):
-                    grad[s, row, j] = n[0] * Jp[i, 0, j] + n[1] * Jp[i, 1, j] + n[2] * Jp[i, 2, j]
+                    grad[s, row, j] = n0 * Jp[i, 0, j] + n1 * Jp[i, 1, j] + n2 * Jp[i, 2, j]
                 row += 1
         for k in range(len(self_pairs)):
             a, b = self_pairs[k, 0], self_pairs[k, 1]

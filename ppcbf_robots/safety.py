@@ -19,6 +19,8 @@ from ppcbf_robots.shapes import Packed, pack
 from ppcbf_robots.specs import Array, BodySphere
 from ppcbf_robots.world import Obstacle
 
+SPEED_SIDES = ("lowest", "highest")  # order of a joint's two rows that keep it in the velocity domain
+
 
 @dataclass(frozen=True)
 class SafetyRows:
@@ -37,12 +39,15 @@ class SafetyRows:
 class SafetyFunction:
     """All rows h_k of a robot in a world.
 
+    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, lowest and highest joint by joint.
+
     Args:
         robot: the robot.
         body: its body spheres.
         obstacles: solid obstacles in the base frame.
         joint_limits: whether finite joint limits are rows too (Remark 1 of the paper).
-        domain: (nv, 2) position ranges that count as joint limits where they are tighter than the robot's.
+        domain: position ranges (nv, 2) that count as joint limits where they are tighter than the robot's.
+        v_domain: velocity ranges (nv, 2) that a filter keeps; None keeps none.
         self_pairs: indices (S, 2) of body spheres that must not touch each other.
 
     Raises:
@@ -56,6 +61,7 @@ class SafetyFunction:
         obstacles: Sequence[Obstacle],
         joint_limits: bool = True,
         domain: Array | None = None,
+        v_domain: Array | None = None,
         self_pairs: Sequence[tuple[int, int]] = (),
     ) -> None:
         if not body:
@@ -78,6 +84,10 @@ class SafetyFunction:
         self.pairs = len(self.names)
         self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in limits]
         self.rows = len(self.names)
+        self.v_domain = np.zeros((0, 2)) if v_domain is None else v_domain
+        self.names += [
+            f"{robot.joint_names[i]} {side} speed" for i in range(len(self.v_domain)) for side in SPEED_SIDES
+        ]
 
     def _limit_rows(self, wanted: bool, domain: Array | None) -> list[tuple[int, float, float]]:
         """(joint, sign, bound) of every finite bound: ``h = sign (q - bound)``."""

@@ -68,9 +68,13 @@ class Packed:
 
     def distance(self, o: int, p: Array) -> float:
         """Smoothed distance [m] of a point (3,) in the base frame to obstacle o, margin not counted."""
-        x = self.frames[o, :, :3].T @ (p - self.frames[o, :, 3])
-        planes = self.planes[self.plane_start[o] : self.plane_start[o + 1]]
-        return float(kernels.core(int(self.kinds[o]), x, np.zeros(3), self.sizes[o], planes, np.zeros(3))[0])
+        x, y, z = self.frames[o, :, :3].T @ (p - self.frames[o, :, 3])
+        return float(self.core(o, (x, y, z), (0.0, 0.0, 0.0))[0])
+
+    def core(self, o: int, x: kernels.Vector, w: kernels.Vector) -> kernels.Core:
+        """:func:`ppcbf_robots.kernels.core` of obstacle o, for a point and its velocity in the obstacle's frame."""
+        first, end = int(self.plane_start[o]), int(self.plane_start[o + 1])
+        return kernels.core(int(self.kinds[o]), x, w, self.sizes[o], self.planes, first, end)
 
 
 def pack(obstacles: Sequence[Obstacle]) -> Packed:

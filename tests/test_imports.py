@@ -18,7 +18,7 @@ LAYERS = [
     ["shapes"],
     ["robot"],
     ["safety", "controllers", "network"],
-    ["barriers", "derive", "qp"],
+    ["barriers", "derive", "qp", "condense"],
     ["filters"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence"],

@@ -8,7 +8,6 @@ import pinocchio as pin
 import pytest
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.kernels import core
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.shapes import Motion, Packed, pack, smoothing_gap
 from ppcbf_robots.specs import Array, BodySphere
@@ -217,10 +216,10 @@ def test_shapes_have_exact_first_and_second_order_terms(panda, states, along_mot
 
 def largest_jump(packed: Packed, p0: Array, w: Array, steps: int) -> float:
     """Largest change of the second order term between neighbouring points outside the obstacle on a line."""
-    R, origin, n = packed.frames[0, :, :3], packed.frames[0, :, 3], np.zeros(3)
+    R, origin = packed.frames[0, :, :3], packed.frames[0, :, 3]
     x0, along = R.T @ (p0 - origin), R.T @ w
     points = x0 + np.linspace(0.0, 1.0, steps + 1)[:, None] * along
-    d, second = np.array([core(int(packed.kinds[0]), x, along, packed.sizes[0], packed.planes, n) for x in points]).T
+    d, second = np.array([packed.core(0, tuple(x), tuple(along))[:2] for x in points]).T
     outside = np.minimum(d[1:], d[:-1]) > 0.0
     return float(np.abs(np.diff(second))[outside].max(initial=0.0))
 

@@ -52,11 +52,12 @@ PAPER = Preset(
     samples=1000,
     top=200,
     l2=1e-2,
+    critic_bounds=(1.0, 10_000.0),
     iterations=2_000,
     changes=(
         "K is zero at rest: K = (f(q, v) - f(q, 0))^2 instead of f(q, v)^2, which lets every resting posture stay safe",
         "critics are dimensionless: torque relative to its limit, power relative to u_max . v_max",
-        "the weights of the two critics adapt between 1 and 1000 instead of staying at 100; Top_k averages k = 200",
+        "the weights of the two critics adapt between 1 and 10,000 instead of staying at 100; Top_k averages k = 200",
         "learning rate 3e-4 instead of 1e-5, annealed to a tenth",
         "states on the band come from rays in v instead of rejection, which finds 1 % of them",
         "the exit looks at violations on fresh states and at the volume kept, since L < 0.01 cannot be met on the band",
