@@ -16,11 +16,11 @@ LAYERS = [
     ["specs", "resources"],
     ["urdf", "world", "body"],
     ["robot"],
-    ["safety", "controllers", "network"],
+    ["safety", "controllers", "network", "engines"],
     ["barriers", "derive", "qp"],
     ["filters"],
     ["safety_filter", "problem"],
-    ["rollout", "artefact", "evidence"],
+    ["rollout", "artefact", "evidence", "engine_mujoco"],
     ["learning"],
     ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
     ["cli"],
@@ -32,6 +32,7 @@ OWNERS = {
     "qpsolvers": ["qp"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
+    "mujoco": ["engine_mujoco"],
     "pydantic": ["specs"],
     "yaml": ["specs"],
     "typer": ["cli"],
@@ -120,7 +121,7 @@ def test_libraries_stay_with_their_owners(library):
 
 @pytest.mark.parametrize("module", ["safety_filter", "rollout", "artefact", "problem", "cli.main"])
 def test_the_runtime_starts_without_heavy_libraries(module):
-    heavy = ["torch", "meshcat", "matplotlib", "onnx"]
+    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco"]
     code = f"import sys, {PACKAGE}.{module}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
