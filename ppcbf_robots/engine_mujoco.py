@@ -8,6 +8,7 @@ Robot and obstacles touch; the robot's links pass through each other, and what i
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -22,9 +23,15 @@ from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, BodySphere
 from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Sphere
 
+log = logging.getLogger(__name__)
+
 _POINT = 1e-6  # [m], radius of body spheres without one; MuJoCo has no points
 _THIN = 2e-4  # [m], least extent of a mesh: a flat one has no convex hull
 _PLANE_SIZE = [0.0, 0.0, 1.0]  # without end; the last is the spacing of a drawn grid
+
+
+if mujoco.get_mju_user_warning() is None:  # else they go to stdout and to a file in the working folder
+    mujoco.set_mju_user_warning(log.warning)
 
 
 class _Shape(NamedTuple):
@@ -144,7 +151,8 @@ def _add_links(spec: mujoco.MjSpec, robot: RobotModel) -> list[mujoco.MjsBody]:
         body.explicitinertial = True
         body.mass, body.inertia = 1.0, np.ones(3)  # the true ones follow after compilation
         body.ipos, body.iquat = model.inertias[i].lever, _quaternion(rotation)
-        S = pin.getJointJacobian(model, data, i, pin.ReferenceFrame.LOCAL)[:, model.joints[i].idx_v]
+        J = pin.getJointJacobian(model, data, i, pin.ReferenceFrame.LOCAL)
+        S = J.reshape(6, -1)[:, model.joints[i].idx_v]  # a single joint's Jacobian comes flat
         turns = bool(np.linalg.norm(S[3:]) > 0.5)
         kind = mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE
         body.add_joint(name=_name(i), type=kind, axis=S[3:] if turns else S[:3])
