@@ -92,6 +92,8 @@ def run(problem: Problem, duration: float, filtered: bool = False) -> Trajectory
 def test_dynamics_agree_with_pinocchio(name, load, states):
     problem = load(SPECS.get(name, name))
     engine, model, rng = MujocoEngine(problem), problem.model, np.random.default_rng(1)
+    mass = sum(Y.mass for Y in list(model.model.inertias)[1:])
+    assert engine.model.body_subtreemass[0] == pytest.approx(mass)  # contacts depend on such derived constants
     for q, v in states(problem, 20):
         dyn, u = model.evaluate(q, v), rng.uniform(-1.0, 1.0, model.nv) * model.u_max
         M, bias = engine.mass_and_bias(q, v)
@@ -223,22 +225,28 @@ def test_a_margin_is_not_solid(toy):
     assert contacts_at(toy(), 0.0, near | {"radius": 0.12})
 
 
-BEAM = '<collision><origin xyz="0.3 0 0"/><geometry>{}</geometry></collision>'
+BEAM = '<collision name="beam"><origin xyz="0.3 0 0" rpy="0 1.57079632679 0"/><geometry>{}</geometry></collision>'
 LINKS = {
-    "box": ('<box size="0.2 0.1 0.1"/>', 0.4),
-    "sphere": ('<sphere radius="0.15"/>', 0.45),
-    "cylinder": ('<cylinder radius="0.05" length="0.4"/>', 0.35),
-    "unreadable": ('<mesh filename="missing.stl"/>', 0.6),  # the body sphere stands for the link
+    "box": ('<box size="0.1 0.1 0.2"/>', "", 0.4),
+    "sphere": ('<sphere radius="0.15"/>', "", 0.45),
+    "cylinder": ('<cylinder radius="0.05" length="0.4"/>', "", 0.5),
+    "capsule": ('<cylinder radius="0.05" length="0.4"/>', '<capsule name="beam"/>', 0.55),
+    "mesh": ('<mesh filename="{tmp}/wedge.obj" scale="2 2 2"/>', "", 0.4),
+    "convex": ('<mesh filename="{tmp}/wedge.obj" scale="2 2 2"/>', '<convex name="beam"/>', 0.4),
+    "unreadable": ('<mesh filename="missing.stl"/>', "", 0.6),  # the body sphere stands for the link
 }
+WEDGE = "v 0 0 0.05\nv 0.05 -0.05 -0.05\nv -0.05 -0.05 -0.05\nv 0 0.05 -0.05\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
 
 
 @pytest.mark.parametrize("kind", LINKS)
-def test_shapes_of_links(kind, toy):
-    """``reach`` is where along x the link ends."""
-    shape, reach = LINKS[kind]
-    problem = toy(BEAM.format(shape))
+def test_shapes_of_links(kind, toy, tmp_path):
+    """``reach`` is where along x the link ends; ``stands_for`` is Pinocchio's extension of URDF."""
+    (tmp_path / "wedge.obj").write_text(WEDGE)
+    shape, stands_for, reach = LINKS[kind]
+    beam = BEAM.format(shape.format(tmp=tmp_path))
+    problem = toy(f"{beam}<collision_checking>{stands_for}</collision_checking>")
     (contact,) = contacts_at(problem, 0.0, FAR | {"center": [reach + 0.099, 0.0, 0.0]})
-    assert contact.depth == pytest.approx(0.001, abs=1e-6)
+    assert contact.depth == pytest.approx(0.001, abs=1e-5)
     assert contacts_at(problem, 0.0, FAR | {"center": [reach + 0.101, 0.0, 0.0]}) == []
 
 
