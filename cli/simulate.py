@@ -12,6 +12,7 @@ from rich.progress import track
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
+from ppcbf_robots.engines import Engine, EngineName
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
@@ -37,6 +38,9 @@ def simulate(
     goal: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
     duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="Simulated seconds.")] = 10.0,
     rate: Annotated[float, typer.Option(min=10.0, max=2000.0, help="Control rate [Hz].")] = 1000.0,
+    engine: Annotated[
+        EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")
+    ] = "pinocchio",
     out_file: Annotated[Path, typer.Option("--out", metavar="T.npz")] = Path("trajectory.npz"),
     json: JsonOption = False,
 ) -> None:
@@ -59,7 +63,7 @@ def simulate(
     if abs(dt * rate - 1.0) > 1e-6:
         err.print(f"--rate {rate:g} is rounded to {1.0 / dt:.5g} Hz, whole integration steps of {RK4_STEP} s")
     chosen, config = choose_barrier(problem, barrier, filter, metric, solver, dt)
-    trajectory = run(problem, chosen, config, q, v, duration, {"barrier": barrier})
+    trajectory = run(problem, chosen, config, q, v, duration, {"barrier": barrier}, engine)
     trajectory.save(out_file)
     facts = trajectory.summary(model) | {"outside_domain": outside_domain(problem, trajectory), "out": str(out_file)}
     emit_json(facts) if json else _print(facts, trajectory, problem)
@@ -109,8 +113,10 @@ def run(
     v: Array,
     duration: float,
     meta: dict[str, Any],
+    engine: EngineName = "pinocchio",
 ) -> Trajectory:
     """A rollout with a progress bar; meta names robot, world, barrier and filter."""
+    moved_by = _mujoco(problem) if engine == "mujoco" else None
     runtime = None
     if barrier is not None:
         runtime = SafetyFilter(problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd)
@@ -125,11 +131,23 @@ def run(
     ticks = iter(track(range(max(1, round(duration / config.dt) // 50)), "simulating", console=err, transient=True))
     trajectory = rollout(
         problem.safety, problem.robot.controller, runtime, q, v, duration, config.dt, described,
-        on_step=lambda t: next(ticks, None),
+        on_step=lambda t: next(ticks, None), engine=moved_by,
     )  # fmt: skip
     for _ in ticks:
         pass
     return trajectory
+
+
+def _mujoco(problem: Problem) -> Engine:
+    try:
+        from ppcbf_robots.engine_mujoco import MujocoEngine  # MuJoCo only where it is asked for
+    except ModuleNotFoundError as error:
+        if error.name != "mujoco":
+            raise
+        raise InputError(
+            '--engine mujoco needs the mujoco package; remedy: pip install "ppcbf-robots[mujoco]"'
+        ) from None
+    return MujocoEngine(problem)
 
 
 def _portable(name: str) -> str:
@@ -146,6 +164,7 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
     meta = trajectory.meta
     out.print(
         f"{problem.robot.name} in {problem.world_name}: {meta['barrier_kind']}, {meta['filter']}, {meta['metric']}"
+        + (f"; engine {meta['engine']}" if meta["engine"] != "pinocchio" else "")
     )
     out.print(f"least h            {facts['min_h']:.4f}  (obstacles alone {facts['clearance']:.4f} m)")
     out.print(f"largest torque     {facts['max_torque_ratio']:.3f} of its limit")
@@ -155,5 +174,17 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
     out.print(f"goal reached       {yes(facts['reached_goal'])}  (largest joint error {number(facts['goal_error'])})")
     if facts["rests_on"]:
         out.print(f"rests on           {facts['rests_on']}: a passive filter cannot climb over it")
+    if meta["contacts"] is not None:
+        _print_contacts(meta["contacts"], len(trajectory.t))
     out.print("filter             " + ", ".join(f"{k} {n}" for k, n in facts["filter_counts"].items()))
     out.print(f"wrote {facts['out']}; look at it with: ppcbf view {facts['out']}")
+
+
+def _print_contacts(contacts: dict[str, Any], steps: int) -> None:
+    if not contacts["steps"]:
+        out.print("contact            none")
+        return
+    out.print(f"CONTACT            in {contacts['steps']} of {steps} steps")
+    for c in contacts["pairs"]:
+        pair, depth = f"{c['link']} / {c['obstacle']}", 1e3 * c["depth"]
+        out.print(f"                   {pair} from {c['first']:.3f} s, {depth:.2g} mm deep")

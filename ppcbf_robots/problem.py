@@ -21,7 +21,7 @@ from ppcbf_robots.resources import default_package_dirs, find_example, find_robo
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_spec, vector
-from ppcbf_robots.world import WorldSpec
+from ppcbf_robots.world import Obstacle, WorldSpec
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class Robot:
     def goal(self) -> Array:
         """Goal configuration (nq,)."""
         return self.controller.goal
+
+    def safety(self, obstacles: Sequence[Obstacle]) -> SafetyFunction:
+        """Its safety function among obstacles, with the bounds of X as rows if the spec guards them."""
+        q, v = (self.domain.q, self.domain.v) if self.spec.domain.guard else (None, None)
+        return SafetyFunction(self.model, self.body, obstacles, domain=q, v_domain=v)
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,7 @@ class Problem:
         gains, domain = self.robot.controller.gains, self.robot.domain
         task = {
             "controller": [gains.kind, *(_rounded(x) for x in (gains.kp, gains.kd, gains.max_spring))],
-            "domain": [_rounded(domain.q), _rounded(domain.v)],
+            "domain": [_rounded(domain.q), _rounded(domain.v), self.robot.spec.domain.guard],
         }
         world = [o.model_dump() for o in self.world.obstacles]
         digest = {
@@ -146,7 +151,7 @@ def load_problem(robot: str, world: str) -> Problem:
     loaded = load_robot(robot)
     path = find_world(world)
     spec = load_spec(path, WorldSpec, "obstacle spec")
-    return Problem(loaded, world, spec, SafetyFunction(loaded.model, loaded.body, spec.obstacles))
+    return Problem(loaded, world, spec, loaded.safety(spec.obstacles))
 
 
 def _spec_urdf(path: Path, spec: RobotSpec) -> Path:

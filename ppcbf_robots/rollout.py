@@ -1,4 +1,4 @@
-"""Closed-loop simulation: RK4 between control steps, torque held, energy accounted for."""
+"""Closed-loop simulation: an engine between control steps, torque held, energy and contacts accounted for."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ppcbf_robots.controllers import NominalController
+from ppcbf_robots.engines import ContactLog, Engine, PinocchioEngine
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import Status
 from ppcbf_robots.robot import RobotModel
@@ -76,6 +77,7 @@ class Trajectory:
         rise = float(np.max(self.V - np.minimum.accumulate(self.V)))
         goal = np.asarray(self.meta["goal"])
         error = float(np.max(np.abs(model.difference(self.q[-1], goal))))
+        contacts = self.meta.get("contacts")  # absent in files of version 0.1.0
         return {
             "min_h": float(self.h.min()),
             "clearance": float(self.clearance.min()),
@@ -86,6 +88,8 @@ class Trajectory:
             "goal_error": error,
             "cleared_at": self._cleared_at(),
             "rests_on": self.meta["rests_on"],
+            "contacts": None if contacts is None else contacts["steps"],
+            "contact_with": None if contacts is None else [f"{c['link']} / {c['obstacle']}" for c in contacts["pairs"]],
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
 
@@ -105,6 +109,7 @@ def simulate(
     control_dt: float = 1e-3,
     meta: dict[str, Any] | None = None,
     on_step: Callable[[float], None] | None = None,
+    engine: Engine | None = None,
 ) -> Trajectory:
     """Roll out from (q, v); ``safety_filter`` None applies u_des as it is.
 
@@ -115,17 +120,23 @@ def simulate(
         q: start configuration (nq,).
         v: start velocity (nv,).
         duration: [s].
-        control_dt: control period [s], rounded to whole RK4 steps of 5e-4 s.
+        control_dt: control period [s], rounded to whole integration steps of 5e-4 s.
         meta: stored with the trajectory.
         on_step: called with the time of every 50th step, for progress bars.
+        engine: what moves the robot; by default Pinocchio, which knows no contact.
     """
     model = safety.robot
+    engine = engine or PinocchioEngine(model)
+    engine.reset(q, v)
+    touched = ContactLog()
     substeps = max(1, round(control_dt / RK4_STEP))
     steps = max(1, round(duration / (substeps * RK4_STEP)))
     record: list[tuple[Any, ...]] = []
     last = StepResult(np.zeros(model.nv), Status.FREE, "", np.nan, np.nan, "")
     for i in range(steps + 1):
         t = i * substeps * RK4_STEP
+        q, v = engine.state()
+        touched.add(t, engine.contacts())
         dyn = model.evaluate(q, v)
         nominal = controller.evaluate(dyn)
         rows = safety.evaluate(dyn)
@@ -138,26 +149,13 @@ def simulate(
                        last.status != Status.FREE, int(last.status)))  # fmt: skip
         if not np.all(np.isfinite(last.u)) or not np.all(np.isfinite(v)) or np.abs(v).max() > 1e4:
             break
-        for _ in range(substeps):
-            q, v = _rk4(model, q, v, last.u, RK4_STEP)
+        engine.advance(last.u, RK4_STEP, substeps)
         if on_step is not None and i % 50 == 0:
             on_step(t)
     names = [f for f in Trajectory.__dataclass_fields__ if f != "meta"]
     fields: dict[str, Any] = {k: np.array(x) for k, x in zip(names, zip(*record, strict=True), strict=True)}
     moving = np.abs(fields["v"][-1]) > 0.02 * model.v_max
     rests = last.row if last.status not in (Status.FREE, Status.STOP) and not np.any(moving) else ""
-    extra = {"goal": controller.goal.tolist(), "rests_on": rests or None, "complete": len(record) == steps + 1}
+    extra = {"goal": controller.goal.tolist(), "rests_on": rests or None, "complete": len(record) == steps + 1,
+             "engine": engine.name, "contacts": touched.report()}  # fmt: skip
     return Trajectory(**fields, meta={**(meta or {}), **extra})
-
-
-def _rk4(model: RobotModel, q: Array, v: Array, u: Array, dt: float) -> tuple[Array, Array]:
-    """One Runge-Kutta step on the configuration manifold, torque held."""
-    a1 = model.acceleration(q, v, u)
-    v2 = v + 0.5 * dt * a1
-    a2 = model.acceleration(model.integrate(q, 0.5 * dt * v), v2, u)
-    v3 = v + 0.5 * dt * a2
-    a3 = model.acceleration(model.integrate(q, 0.5 * dt * v2), v3, u)
-    v4 = v + dt * a3
-    a4 = model.acceleration(model.integrate(q, dt * v3), v4, u)
-    mean_v = (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
-    return model.integrate(q, dt * mean_v), v + dt * (a1 + 2.0 * a2 + 2.0 * a3 + a4) / 6.0

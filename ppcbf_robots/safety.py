@@ -39,7 +39,7 @@ class SafetyRows:
 class SafetyFunction:
     """All rows h_k of a robot in a world.
 
-    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, lowest and highest joint by joint.
+    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, joint by joint.
 
     Args:
         robot: the robot.
@@ -85,9 +85,8 @@ class SafetyFunction:
         self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in limits]
         self.rows = len(self.names)
         self.v_domain = np.zeros((0, 2)) if v_domain is None else v_domain
-        self.names += [
-            f"{robot.joint_names[i]} {side} speed" for i in range(len(self.v_domain)) for side in SPEED_SIDES
-        ]
+        guarded = robot.joint_names[: len(self.v_domain)]
+        self.names += [f"{joint} {side} speed" for joint in guarded for side in SPEED_SIDES]
 
     def _limit_rows(self, wanted: bool, domain: Array | None) -> list[tuple[int, float, float]]:
         """(joint, sign, bound) of every finite bound: ``h = sign (q - bound)``."""

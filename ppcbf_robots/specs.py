@@ -60,10 +60,14 @@ class BodySphere(Spec):
 
 
 class DomainSpec(Spec):
-    """The set X on which a barrier is trained, as one (low, high) pair per moving joint."""
+    """The set X on which a barrier is trained, as one (low, high) pair per moving joint.
+
+    With ``guard`` its bounds are rows of the filter too, so that a filtered arm stays in X (Remark 1 of the paper).
+    """
 
     q: list[tuple[float, float]] | None = None
     v: list[tuple[float, float]] | None = None
+    guard: bool = True
 
     @model_validator(mode="after")
     def _ordered(self) -> DomainSpec:

@@ -17,11 +17,11 @@ LAYERS = [
     ["urdf", "world", "body"],
     ["shapes"],
     ["robot"],
-    ["safety", "controllers", "network"],
+    ["safety", "controllers", "network", "engines"],
     ["barriers", "derive", "qp", "condense"],
     ["filters"],
     ["safety_filter", "problem"],
-    ["rollout", "artefact", "evidence"],
+    ["rollout", "artefact", "evidence", "engine_mujoco"],
     ["learning"],
     ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
     ["cli"],
@@ -35,6 +35,7 @@ OWNERS = {
     "qpsolvers": ["qp"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
+    "mujoco": ["engine_mujoco"],
     "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
@@ -123,7 +124,7 @@ def test_libraries_stay_with_their_owners(library):
 
 @pytest.mark.parametrize("module", ["safety_filter", "rollout", "artefact", "problem", "cli.main"])
 def test_the_runtime_starts_without_heavy_libraries(module):
-    heavy = ["torch", "meshcat", "matplotlib", "onnx"]
+    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco"]
     code = f"import sys, {PACKAGE}.{module}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

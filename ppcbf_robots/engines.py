@@ -1,0 +1,107 @@
+"""What moves the robot in a rollout: an engine takes a state and a torque some way ahead in time.
+
+Pinocchio's articulated-body algorithm with RK4 is the default and knows no contact. Another engine (see
+:mod:`ppcbf_robots.engine_mujoco`) implements the same protocol; the control loop and its record stay one piece of code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from ppcbf_robots.robot import RobotModel
+from ppcbf_robots.specs import Array
+
+EngineName = Literal["pinocchio", "mujoco"]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A link that touches an obstacle at one instant."""
+
+    link: str
+    obstacle: str
+    depth: float  # [m], penetration
+
+
+class Engine(Protocol):
+    """A robot in motion."""
+
+    name: EngineName
+
+    def reset(self, q: Array, v: Array) -> None:
+        """Put the robot into the state (q, v); q (nq,) in Pinocchio's coordinates, v (nv,)."""
+
+    def state(self) -> tuple[Array, Array]:
+        """(q, v) now, as in :meth:`reset`."""
+
+    def advance(self, u: Array, dt: float, count: int) -> None:
+        """``count`` integration steps of ``dt`` [s] under the torque u (nv,), held."""
+
+    def contacts(self) -> Sequence[Contact] | None:
+        """What touches in the present state; None if the engine knows no contact."""
+
+
+class PinocchioEngine:
+    """Free motion by Pinocchio's forward dynamics and RK4; obstacles do not push back."""
+
+    name: EngineName = "pinocchio"
+
+    def __init__(self, robot: RobotModel) -> None:
+        self.robot = robot
+        self._q, self._v = np.zeros(robot.nq), np.zeros(robot.nv)
+
+    def reset(self, q: Array, v: Array) -> None:
+        """See :class:`Engine`."""
+        self._q, self._v = q, v
+
+    def state(self) -> tuple[Array, Array]:
+        """See :class:`Engine`."""
+        return self._q, self._v
+
+    def advance(self, u: Array, dt: float, count: int) -> None:
+        """See :class:`Engine`."""
+        for _ in range(count):
+            self._q, self._v = _rk4(self.robot, self._q, self._v, u, dt)
+
+    def contacts(self) -> None:
+        """None: there is no contact here."""
+        return None
+
+
+class ContactLog:
+    """Collects the contacts of a rollout."""
+
+    def __init__(self) -> None:
+        self._known = False
+        self._steps = 0
+        self._pairs: dict[tuple[str, str], dict[str, Any]] = {}  # in the order of first contact
+
+    def add(self, t: float, contacts: Sequence[Contact] | None) -> None:
+        """Contacts of the state at the control step of time t [s]."""
+        self._known = contacts is not None
+        self._steps += bool(contacts)
+        for c in contacts or ():
+            new = {"link": c.link, "obstacle": c.obstacle, "first": t, "depth": c.depth}
+            pair = self._pairs.setdefault((c.link, c.obstacle), new)
+            pair["depth"] = max(pair["depth"], c.depth)
+
+    def report(self) -> dict[str, Any] | None:
+        """Control steps in contact and, per pair, first time [s] and largest penetration [m]; None if unknown."""
+        return {"steps": self._steps, "pairs": list(self._pairs.values())} if self._known else None
+
+
+def _rk4(model: RobotModel, q: Array, v: Array, u: Array, dt: float) -> tuple[Array, Array]:
+    """One Runge-Kutta step on the configuration manifold, torque held."""
+    a1 = model.acceleration(q, v, u)
+    v2 = v + 0.5 * dt * a1
+    a2 = model.acceleration(model.integrate(q, 0.5 * dt * v), v2, u)
+    v3 = v + 0.5 * dt * a2
+    a3 = model.acceleration(model.integrate(q, 0.5 * dt * v2), v3, u)
+    v4 = v + dt * a3
+    a4 = model.acceleration(model.integrate(q, dt * v3), v4, u)
+    mean_v = (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
+    return model.integrate(q, dt * mean_v), v + dt * (a1 + 2.0 * a2 + 2.0 * a3 + a4) / 6.0
