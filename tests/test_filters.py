@@ -101,10 +101,21 @@ def test_energy_barrier_closed_form_rests_without_chatter(two_link):
 # ---------------------------------------------------------------------------------------------- QP: optimality
 
 
-def reference_qp(dyn, rows, u_des, d_p, u_max, barrier, config):
+def speed_rows(dyn, v_domain, u_des, alpha):
+    """``v̇ >= -alpha (v - low)`` and ``-v̇ >= -alpha (high - v)`` as rows of u, and their slack at u_des."""
+    if not len(v_domain):
+        return np.zeros((0, len(dyn.v))), np.zeros(0)
+    a = dyn.Minv @ (u_des - dyn.b)
+    slack = np.concatenate([a + alpha * (dyn.v - v_domain[:, 0]), -a + alpha * (v_domain[:, 1] - dyn.v)])
+    return np.vstack([dyn.Minv, -dyn.Minv]), slack
+
+
+def reference_qp(dyn, rows, u_des, d_p, u_max, barrier, config, v_domain=()):
     """The whole QP, every row at once, by DAQP: the torque, or None if infeasible."""
     H = weight(dyn, config.metric) * np.outer(u_max, u_max)
-    C, lower = rows.Lg_phi * u_max, -qp_slack(barrier, rows, u_des, config)
+    speed, slack = speed_rows(dyn, v_domain, u_des, config.alpha)
+    C = np.vstack([rows.Lg_phi, speed]) * u_max
+    lower = -np.concatenate([qp_slack(barrier, rows, u_des, config), slack])
     if d_p is not None:
         C, lower = np.vstack([C, -dyn.v * u_max]), np.append(lower, -d_p)
     scale = np.linalg.norm(C, axis=1)
@@ -120,16 +131,17 @@ def test_qp_is_the_least_correction_over_all_rows(problem, states, make_barrier,
     """Against an active-set solver that is given every row, on random states; statuses must agree as well."""
     model, barrier, config = problem.model, make_barrier(problem, "pp-ncbf-convex"), FilterConfig(metric=metric)
     qp_filter, seen = QPFilter(barrier, problem.safety, config), dict.fromkeys(Status, 0)
+    v_domain = problem.safety.v_domain
     for q, v in states(problem, 120):
         dyn, rows = rows_at(problem, barrier, q, 0.5 * v)
         if rows.h.min() < 0.0:
             continue
         nominal = problem.robot.controller.evaluate(dyn)
         answer = qp_filter.correct(dyn, rows, nominal.u, float(nominal.d_p), model.u_max)
-        expected = reference_qp(dyn, rows, nominal.u, float(nominal.d_p), model.u_max, barrier, config)
+        expected = reference_qp(dyn, rows, nominal.u, float(nominal.d_p), model.u_max, barrier, config, v_domain)
         status = Status.CORRECTING
         if expected is None:
-            expected = reference_qp(dyn, rows, nominal.u, None, model.u_max, barrier, config)
+            expected = reference_qp(dyn, rows, nominal.u, None, model.u_max, barrier, config, v_domain)
             status = Status.PASSIVITY_DROPPED
         seen[answer.status] += 1
         if expected is None:
