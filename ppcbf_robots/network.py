@@ -137,3 +137,14 @@ class NumpyNetwork:
     def value_and_grad(self, q: Any, v: Any) -> tuple[Any, Any, Any]:
         """See :func:`value_and_grad`."""
         return value_and_grad(np, self.kind, self.params, q, v)
+
+
+def random_convex(nq: int, nv: int, hidden: tuple[int, ...], units: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Small random parameters of the convex form; for benchmarks and examples, not a barrier to rely on."""
+    widths = (nq, *hidden)
+    params: dict[str, Any] = {"in_shift": np.zeros(nq), "in_scale": np.ones(nq), "v_scale": np.ones(nv)}
+    for i, (a, b) in enumerate(zip(widths, widths[1:], strict=False)):
+        params |= {f"W{i}": rng.normal(0.0, a**-0.5, (a, b)), f"b{i}": np.zeros(b)}
+    for name, outputs, bias in (("a", units, -4.0), ("b", units * nv, 0.0), ("c", units, -1.0)):
+        params |= {f"W{name}": rng.normal(0.0, 0.1, (widths[-1], outputs)), f"b{name}": np.full(outputs, bias)}
+    return params
