@@ -27,6 +27,7 @@ KINDS: dict[str, type[Spec]] = {
 }
 MAX_NUMBER = 1e4  # [m]; farther than any arm reaches
 QUATERNION_TOLERANCE = 0.02  # files hold two digits at times; world specs are stricter
+DECIMALS = 12  # of composed poses, which hides what floating point adds to zeros
 CONE_SIDES = 24
 
 
@@ -45,12 +46,13 @@ class Scene:
     def add(self, where: str, kind: str, name: str, pose: pin.SE3, **fields: Any) -> None:
         """An obstacle of a kind at a pose in the base frame; InputError if its numbers make no sense."""
         data = {"type": kind, "name": name, **fields}
+        xyz, xyzw = _tidy(pose.translation), _tidy(pin.Quaternion(pose.rotation).coeffs())
         if kind == "sphere":
-            data["center"] = pose.translation.tolist()
+            data["center"] = xyz
         else:
-            data["xyz"] = pose.translation.tolist()
-            if not np.array_equal(pose.rotation, np.eye(3)):
-                data["quat_xyzw"] = pin.Quaternion(pose.rotation).coeffs().tolist()
+            data["xyz"] = xyz
+            if any(xyzw[:3]):
+                data["quat_xyzw"] = xyzw
         self.obstacles.append(validate(data, KINDS[kind], self.at(where)))
 
     def add_points(self, where: str, name: str, pose: pin.SE3, points: Array) -> None:
@@ -71,7 +73,8 @@ class Scene:
         corner = positive(radius, self.at(where)) / math.cos(math.pi / CONE_SIDES)
         half = 0.5 * positive(length, self.at(where))
         base = np.column_stack([corner * np.cos(turn), corner * np.sin(turn), np.full(CONE_SIDES, -half)])
-        self.add(where, "mesh", name, pose, vertices=hull(np.vstack([base, [0.0, 0.0, half]]), self.at(where)))
+        points = np.round(np.vstack([base, [0.0, 0.0, half]]), DECIMALS)
+        self.add(where, "mesh", name, pose, vertices=hull(points, self.at(where)))
         grown = 1.0 / math.cos(math.pi / CONE_SIDES) - 1.0
         self.notes.append(f"'{name}' is a cone: it becomes a pyramid around it, at most {grown:.1%} wider")
 
@@ -85,8 +88,7 @@ class Scene:
         offset = float(normal @ pose.translation) - d / length
         if offset > 0.0:  # the base is on the negative side, so that is the free one
             normal, offset = -normal, -offset
-        fields = {"normal": (normal + 0.0).tolist(), "offset": offset + 0.0}  # + 0.0 turns -0.0 into 0.0
-        data = {"type": "half_space", "name": name, **fields}
+        data = {"type": "half_space", "name": name, "normal": _tidy(normal), "offset": offset + 0.0}
         self.obstacles.append(validate(data, HalfSpace, self.at(where)))
         shown = ", ".join(f"{x:.3g}" for x in normal)
         self.notes.append(f"'{name}' is a plane: the side of the base stays free (normal {shown}), the other is solid")
@@ -96,6 +98,11 @@ class Scene:
         if not self.obstacles:
             raise InputError(f"{self.path}: the file holds no obstacles")
         return validate({"obstacles": self.obstacles}, WorldSpec, str(self.path))
+
+
+def _tidy(values: Array) -> list[float]:
+    """Rounded, and without negative zeros."""
+    return [float(x) + 0.0 for x in np.round(values, DECIMALS)]
 
 
 def number(value: Any, where: str) -> float:

@@ -11,6 +11,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.world import ConvexMesh, Obstacle, WorldSpec
 
 DIGITS = 9  # nanometres at a metre
+VERTEX_DIGITS = 7  # what mesh files hold
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")  # that YAML readers may not take as text
 
@@ -53,18 +54,18 @@ def _mesh(mesh: ConvexMesh) -> list[str]:
     lines = [f"  - {first}", *(f"    {field}" for field in rest)]
     if mesh.vertices is None:
         return lines
-    return [*lines, "    vertices:", *(f"      - {_value(vertex)}" for vertex in mesh.vertices)]
+    return [*lines, "    vertices:", *(f"      - {_value(v, VERTEX_DIGITS)}" for v in mesh.vertices)]
 
 
-def _value(value: object) -> str:
+def _value(value: object, digits: int = DIGITS) -> str:
     if isinstance(value, list):
-        return f"[{', '.join(_value(x) for x in value)}]"
-    return _number(value) if isinstance(value, float) else _text(str(value), plain=True)
+        return f"[{', '.join(_value(x, digits) for x in value)}]"
+    return _number(value, digits) if isinstance(value, float) else _text(str(value), plain=True)
 
 
-def _number(x: float) -> str:
+def _number(x: float, digits: int) -> str:
     """Never with an exponent, which some YAML readers take for text."""
-    text = np.format_float_positional(x, precision=DIGITS, fractional=False, trim="0")
+    text = np.format_float_positional(x, precision=digits, fractional=False, trim="0")
     return "0.0" if float(text) == 0.0 else text
 
 
