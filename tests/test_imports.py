@@ -15,7 +15,8 @@ LAYERS = [
     ["errors"],
     ["specs", "resources"],
     ["urdf", "world", "body"],
-    ["robot"],
+    ["robot", "world_shapes"],
+    ["world_files"],
     ["safety", "controllers", "network"],
     ["barriers", "derive", "qp"],
     ["filters"],
@@ -25,7 +26,7 @@ LAYERS = [
     ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
     ["cli"],
 ]
-"""From the bottom up; learning and cli are packages. A module imports from lower layers and from its own."""
+"""From the bottom up; world_files, learning and cli are packages. A module imports from lower layers and from its own."""
 
 OWNERS = {
     "proxsuite": ["qp"],
@@ -44,6 +45,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = {
     **{p.stem: p for p in (ROOT / PACKAGE).glob("*.py")},
     **{f"learning.{p.stem}": p for p in (ROOT / PACKAGE / "learning").glob("*.py")},
+    **{f"world_files.{p.stem}": p for p in (ROOT / PACKAGE / "world_files").glob("*.py")},
     **{f"cli.{p.stem}": p for p in (ROOT / "cli").glob("*.py")},
 }
 MODULES = sorted(name for name in SOURCES if name.split(".")[-1] != "__init__")

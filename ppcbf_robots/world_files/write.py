@@ -30,12 +30,11 @@ def write_world(world: WorldSpec, path: Path, title: str, overwrite: bool = Fals
     Raises:
         InputError: if the file exists and must not be overwritten, or cannot be written.
     """
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists; give --force to overwrite it")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w" if overwrite else "x", encoding="utf-8") as file:
-            file.write(world_yaml(world, title))
-    except FileExistsError:
-        raise InputError(f"{path} exists; give --force to overwrite it") from None
+        path.write_text(world_yaml(world, title), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
