@@ -1,7 +1,4 @@
-"""Runs in 3D: one robot per trajectory in the same world, its path, and what the filter does while it plays.
-
-The page is meshcat's viewer with its animation and our legend. Only this module and its two helpers know meshcat.
-"""
+"""Runs in 3D in meshcat's viewer: one robot per trajectory, its path, and what the filter does while it plays."""
 
 from __future__ import annotations
 

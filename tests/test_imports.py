@@ -26,14 +26,14 @@ LAYERS = [
     ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
     ["cli"],
 ]
-"""From the bottom up; world_files, learning and cli are packages. A module imports from lower layers and from its own."""
+"""From the bottom up; world_files, learning and cli are packages. A module imports from lower layers and its own."""
 
 OWNERS = {
     "proxsuite": ["qp"],
     "qpsolvers": ["qp"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
-    "pydantic": ["specs"],
+    "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
     "torch": ["learning", "export", "cli"],

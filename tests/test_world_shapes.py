@@ -21,7 +21,7 @@ from ppcbf_robots.problem import load_problem
 from ppcbf_robots.resources import bundled, find_world
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.viewer_shapes import drawable
-from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace
+from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Sphere
 from ppcbf_robots.world_files.load import load_world, read_world
 from ppcbf_robots.world_shapes import Solid, coal_shape, surface_points
 
