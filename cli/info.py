@@ -8,7 +8,7 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, obstacle_rows, out, table
 from ppcbf_robots.evidence import check_band
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.problem import Problem, Robot, load_problem, load_robot
@@ -118,9 +118,8 @@ def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
 
 
 def _print_world(problem: Problem, facts: dict[str, Any]) -> None:
-    rows = [[o.name, o.type, ", ".join(f"{k} {v}" for k, v in o.model_dump(exclude={"name", "type"}).items())]
-            for o in problem.world.obstacles]  # fmt: skip
-    table(f"world {problem.world_name}: {problem.safety.pairs} pairs with the body", ["obstacle", "type", ""], rows)
+    title = f"world {problem.world_name}: {problem.safety.pairs} pairs with the body"
+    table(title, ["obstacle", "type", ""], obstacle_rows(problem.world))
     out.print(f"start clearance {facts['start_clearance']:.4f} ({facts['start_nearest']})")
     share, n = facts["lb_infeasible"], facts["lb_samples"]
     if not n:

@@ -10,6 +10,7 @@ import typer
 from rich.text import Text
 
 from ppcbf_robots.cli.compare import compare
+from ppcbf_robots.cli.convert import convert
 from ppcbf_robots.cli.export import export
 from ppcbf_robots.cli.info import info
 from ppcbf_robots.cli.output import err
@@ -26,7 +27,7 @@ app = typer.Typer(
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
     "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed.",
 )
-for command in (info, train, simulate, compare, view, export):
+for command in (info, train, simulate, compare, view, export, convert):
     app.command()(command)
 
 

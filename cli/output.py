@@ -11,6 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from ppcbf_robots.world import WorldSpec
+
 _PIPE_WIDTH = 120  # of tables that do not go to a terminal
 _width = None if sys.stdout.isatty() else _PIPE_WIDTH
 out = Console(highlight=False, markup=False, soft_wrap=True, width=_width)  # no markup: units and paths have brackets
@@ -19,7 +21,10 @@ err = Console(stderr=True, highlight=False, markup=False)
 RobotArgument = Annotated[
     str, typer.Argument(metavar="ROBOT", help="Bundled name, robot spec (YAML), URDF path, or example-robot-data name.")
 ]
-WorldArgument = Annotated[str, typer.Argument(metavar="OBSTACLES", help="Bundled world name or YAML path.")]
+WorldArgument = Annotated[
+    str,
+    typer.Argument(metavar="OBSTACLES", help="Bundled world name, or path: YAML (ours, cuRobo, MoveIt), .scene, URDF."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout instead of text.")]
 
 
@@ -46,6 +51,21 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     for row in rows:
         t.add_row(*row)
     out.print(t)
+
+
+def obstacle_rows(world: WorldSpec) -> list[list[str]]:
+    """Name, type and measures of every obstacle, for a table."""
+    rows = []
+    for o in world.obstacles:
+        facts = o.model_dump(exclude={"name", "type"}, exclude_defaults=True)
+        if "vertices" in facts:
+            facts["vertices"] = len(facts["vertices"])
+        rows.append([o.name, o.type, ", ".join(f"{k} {_short(v)}" for k, v in facts.items())])
+    return rows
+
+
+def _short(value: Any) -> str:
+    return f"[{', '.join(map(_short, value))}]" if isinstance(value, list) else f"{value:.4g}"
 
 
 def number(x: float | None, digits: int = 4) -> str:

@@ -18,6 +18,8 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.rollout import Trajectory
 from ppcbf_robots.specs import Array
+from ppcbf_robots.world import HalfSpace, Obstacle, Sphere
+from ppcbf_robots.world_shapes import surface_points
 
 GRID = 121  # points per axis of a safe-set slice
 MAX_JOINTS = 8
@@ -61,17 +63,45 @@ def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> 
             ax.plot(p[:, 0], p[:, k], label=label)
     for ax, k, name in zip(axes, (2, 1), "zy", strict=True):
         for o in problem.world.obstacles:
-            if o.type == "sphere":
-                ax.add_patch(patches.Circle((o.center[0], o.center[k]), o.radius, color="0.7"))
-            elif np.hypot(o.normal[0], o.normal[k]) > 0.999:  # stands upright on the drawn plane
-                at = np.array([o.normal[0], o.normal[k]]) * o.offset
-                ax.axline(tuple(at), tuple(at + np.array([-o.normal[k], o.normal[0]])), color="0.5", lw=3)
+            _draw_obstacle(ax, o, k)
         ax.set_xlabel("x [m]")
         ax.set_ylabel(f"{name} [m]")
         ax.set_aspect("equal", adjustable="datalim")
         ax.grid(alpha=0.3)
     axes[0].legend(frameon=False)
     _save(fig, path)
+
+
+def _draw_obstacle(ax: Any, obstacle: Obstacle, k: int) -> None:
+    """Shadow of an obstacle on the plane of x and axis k."""
+    match obstacle:
+        case Sphere():
+            ax.add_patch(patches.Circle((obstacle.center[0], obstacle.center[k]), obstacle.radius, color="0.7"))
+        case HalfSpace():
+            normal = np.array([obstacle.normal[0], obstacle.normal[k]])
+            if np.hypot(*normal) > 0.999:  # stands upright on the drawn plane
+                at = normal * obstacle.offset
+                ax.axline(tuple(at), tuple(at + np.array([-normal[1], normal[0]])), color="0.5", lw=3)
+        case _:
+            ax.add_patch(patches.Polygon(outline(surface_points(obstacle)[:, [0, k]]), color="0.7"))
+
+
+def outline(points: Array) -> Array:
+    """Corners (M, 2) of the convex hull of points (N, 2), counter-clockwise."""
+
+    def chain(ordered: Array) -> list[Array]:
+        corners: list[Array] = []
+        for p in ordered:
+            while len(corners) > 1:
+                a, b = corners[-1] - corners[-2], p - corners[-1]
+                if a[0] * b[1] - a[1] * b[0] > 0.0:
+                    break
+                corners.pop()
+            corners.append(p)
+        return corners[:-1]  # the last one begins the other chain
+
+    ordered = np.unique(points, axis=0)
+    return np.array(chain(ordered) + chain(ordered[::-1])) if len(ordered) > 1 else ordered
 
 
 def _tip_path(problem: Problem, run: Trajectory) -> Array:

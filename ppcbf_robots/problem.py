@@ -22,6 +22,7 @@ from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_spec, vector
 from ppcbf_robots.world import Obstacle, WorldSpec
+from ppcbf_robots.world_files.load import load_world
 
 
 @dataclass(frozen=True)
@@ -149,8 +150,7 @@ def load_robot(name: str) -> Robot:
 def load_problem(robot: str, world: str) -> Problem:
     """A robot and a world by name or path; InputError where they do not fit."""
     loaded = load_robot(robot)
-    path = find_world(world)
-    spec = load_spec(path, WorldSpec, "obstacle spec")
+    spec = load_world(find_world(world))
     return Problem(loaded, world, spec, loaded.safety(spec.obstacles))
 
 

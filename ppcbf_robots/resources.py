@@ -8,6 +8,9 @@ from pathlib import Path
 
 from ppcbf_robots.errors import InputError
 
+YAML_SUFFIXES = (".yaml", ".yml")
+WORLD_SUFFIXES = (".scene", ".urdf", ".xml")  # of worlds that are not YAML
+
 
 def bundled(folder: str, suffix: str = ".yaml") -> dict[str, Path]:
     """Bundled files by name; ``folder`` is 'robots' or 'obstacles'."""
@@ -45,16 +48,18 @@ def find_example(name: str) -> Path | None:
 
 
 def find_world(name: str) -> Path:
-    """Path of an obstacle spec: a file as given, or a bundled name; InputError if neither."""
+    """Path of a world: a file as given, or a bundled name; InputError if neither."""
     path = Path(name)
-    if path.suffix in (".yaml", ".yml"):
+    if path.suffix.lower() in (*YAML_SUFFIXES, *WORLD_SUFFIXES):
         if path.is_file():
             return path
         raise InputError(f"obstacle file not found: {path}")
     worlds = bundled("obstacles")
     if name in worlds:
         return worlds[name]
-    raise InputError(f"no world named '{name}': give a YAML path or a bundled name ({', '.join(worlds)})")
+    raise InputError(
+        f"no world named '{name}': give a YAML, .scene or URDF path or a bundled name ({', '.join(worlds)})"
+    )
 
 
 def _example_urdfs() -> dict[str, Path]:
@@ -67,7 +72,7 @@ def _example_urdfs() -> dict[str, Path]:
 
 
 def default_package_dirs(urdf: Path) -> list[Path]:
-    """Folders against which ``package://`` is tried: around the URDF and example-robot-data's share."""
+    """Folders against which ``package://`` is tried: around the file and example-robot-data's share."""
     around = list(urdf.resolve().parents)[:5]
     example = _example_urdfs()
     share = next((p for path in example.values() for p in path.parents if p.name == "share"), None)

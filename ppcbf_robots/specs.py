@@ -169,6 +169,11 @@ def load_spec(path: Path, kind: type[S], what: str) -> S:
     Raises:
         InputError: one sentence naming the file, the line or the key, and what was expected.
     """
+    return validate(read_mapping(path, what, list(kind.model_fields)[:3]), kind, str(path))
+
+
+def read_mapping(path: Path, what: str, keys: Sequence[str]) -> dict[str, Any]:
+    """Plain data of a YAML file whose top level is a mapping with keys such as ``keys``; InputError as for a spec."""
     text = read_text(path, what)
     if len(text) > MAX_SPEC_BYTES:
         raise InputError(f"{path}: larger than {MAX_SPEC_BYTES // 10**6} MB, which no {what} is")
@@ -181,8 +186,8 @@ def load_spec(path: Path, kind: type[S], what: str) -> S:
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a mapping with keys such as {', '.join(list(kind.model_fields)[:3])}")
-    return validate(data, kind, str(path))
+        raise InputError(f"{path}: expected a mapping with keys such as {', '.join(keys)}")
+    return data
 
 
 def validate(data: dict[str, Any], kind: type[S], where: str) -> S:

@@ -1,7 +1,4 @@
-"""Runs in 3D: one robot per trajectory in the same world, its path, and what the filter does while it plays.
-
-The page is meshcat's viewer with its animation and our legend. Only this module and its two helpers know meshcat.
-"""
+"""Runs in 3D in meshcat's viewer: one robot per trajectory, its path, and what the filter does while it plays."""
 
 from __future__ import annotations
 
@@ -23,8 +20,9 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.rollout import Trajectory
 from ppcbf_robots.specs import Array
 from ppcbf_robots.viewer_page import PageServer, Recorder, render
-from ppcbf_robots.viewer_shapes import align, ball, beads, floor_grid, robot_parts
-from ppcbf_robots.world import Obstacle, Sphere
+from ppcbf_robots.viewer_shapes import align, beads, drawable, floor_grid, robot_parts
+from ppcbf_robots.world import HalfSpace, Obstacle
+from ppcbf_robots.world_shapes import coal_shape, surface_points
 
 FPS = 30
 ROBOT_COLORS = (0x5B8FD0, 0x63AD72, 0x9B7CC8, 0x3FB0B8, 0xB58A6A, 0x8A93A0)
@@ -186,9 +184,7 @@ def _resample(trajectory: Trajectory, frames: int) -> tuple[Array, Array, Array]
 def _view(problem: Problem, runs: Sequence[_Run]) -> _View:
     points = [r.placements[:, :, :3, 3].reshape(-1, 3) for r in runs] + [r.tip for r in runs]
     flat = bool(np.ptp(np.concatenate(points)[:, 1]) < 1e-3)
-    for o in problem.world.obstacles:
-        if isinstance(o, Sphere):
-            points.append(np.array(o.center) + o.radius * np.concatenate([np.eye(3), -np.eye(3)]))
+    points += [surface_points(o) for o in problem.world.obstacles if not isinstance(o, HalfSpace)]
     seen = np.concatenate(points)
     low, high = seen.min(axis=0), seen.max(axis=0)
     return _View((low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, 0.05), flat)
@@ -204,10 +200,11 @@ def _draw_stage(scene: meshcat.Visualizer, view: _View) -> None:
 
 
 def _draw_obstacle(node: meshcat.Visualizer, obstacle: Obstacle, view: _View) -> None:
-    """A ball, or a thin plate on the solid side of the plane, next to what is looked at."""
-    if isinstance(obstacle, Sphere):
-        node.set_object(ball(obstacle.radius), _material(OBSTACLE_COLOR, 0.8))
-        node.set_transform(pin.SE3(np.eye(3), np.array(obstacle.center)).homogeneous)
+    """The solid itself, or a thin plate on the solid side of a plane, next to what is looked at."""
+    if not isinstance(obstacle, HalfSpace):
+        shape, placement = coal_shape(obstacle)
+        node.set_object(drawable(shape), _material(OBSTACLE_COLOR, 0.8))
+        node.set_transform(placement)
         return
     normal, size = np.array(obstacle.normal), 2.6 * view.radius
     foot = view.center - (normal @ view.center - obstacle.offset) * normal

@@ -1,4 +1,4 @@
-"""What a robot looks like: its URDF geometry as meshcat geometries, one list per joint.
+"""What robots and obstacles look like: coal's shapes as meshcat geometries; a robot's in one list per joint.
 
 Meshes come from Pinocchio, which has read and scaled them whatever their format; meshcat only draws triangles.
 """
@@ -48,7 +48,7 @@ def robot_parts(robot: RobotModel, tip_joint: int, tip: Array) -> list[Part]:
 
 
 def drawable(shape: coal.CollisionGeometry) -> mg.Geometry:
-    """A box, sphere, cylinder, capsule or triangle mesh of a URDF for meshcat, in the same frame."""
+    """A box, sphere, cylinder, capsule, convex hull or triangle mesh for meshcat, in the same frame."""
     match shape:
         case coal.Box():
             return mg.Box([float(2.0 * x) for x in shape.halfSide])
@@ -58,6 +58,8 @@ def drawable(shape: coal.CollisionGeometry) -> mg.Geometry:
             return _cylinder(float(shape.radius), float(shape.halfLength))
         case coal.Capsule():
             return _capsule(float(shape.radius), float(shape.halfLength))
+        case coal.Convex():
+            return _faceted(shape)
     triangles = (shape.tri_indices(i) for i in range(shape.num_tris))
     return mg.TriangularMeshGeometry(shape.vertices(), np.array([[t[0], t[1], t[2]] for t in triangles]))
 
@@ -66,6 +68,13 @@ def align(direction: Array, origin: Array) -> Array:
     """Placement (4, 4) at ``origin`` whose z axis points along ``direction``."""
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.asarray(direction, float)).matrix()
     return np.asarray(pin.SE3(rotation, np.asarray(origin, float)).homogeneous)
+
+
+def _faceted(shape: coal.Convex) -> mg.Geometry:
+    """Every triangle with corners of its own, so that the shading keeps the edges."""
+    faces = [shape.polygons(i) for i in range(shape.num_polygons)]
+    corners = np.asarray(shape.points())[[k for f in faces for k in (f[0], f[1], f[2])]]
+    return mg.TriangularMeshGeometry(corners, np.arange(len(corners)).reshape(-1, 3))
 
 
 def ball(radius: float) -> mg.Geometry:

@@ -15,18 +15,19 @@ LAYERS = [
     ["errors"],
     ["specs", "resources", "kernels"],
     ["urdf", "world", "body"],
-    ["shapes"],
-    ["robot"],
+    ["shapes", "world_shapes"],
+    ["robot", "world_files"],
     ["safety", "controllers", "network", "engines"],
     ["barriers", "derive", "qp", "condense"],
     ["filters"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco"],
+    ["benchmark"],
     ["learning"],
     ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
     ["cli"],
 ]
-"""From the bottom up; learning and cli are packages. A module imports from lower layers and from its own."""
+"""From the bottom up; world_files, learning and cli are packages. A module imports from lower layers and its own."""
 
 OWNERS = {
     "numba": ["kernels"],
@@ -48,6 +49,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = {
     **{p.stem: p for p in (ROOT / PACKAGE).glob("*.py")},
     **{f"learning.{p.stem}": p for p in (ROOT / PACKAGE / "learning").glob("*.py")},
+    **{f"world_files.{p.stem}": p for p in (ROOT / PACKAGE / "world_files").glob("*.py")},
     **{f"cli.{p.stem}": p for p in (ROOT / "cli").glob("*.py")},
 }
 MODULES = sorted(name for name in SOURCES if name.split(".")[-1] != "__init__")

@@ -34,7 +34,7 @@ def commands() -> list[list[str]]:
 
 
 def test_the_readme_names_every_command() -> None:
-    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare"}
+    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare", "convert"}
 
 
 @pytest.mark.slow

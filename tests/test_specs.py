@@ -351,7 +351,8 @@ def test_missing_files_and_unknown_names(tmp_path):
     )
     assert message(find_world, "nope.yaml") == "obstacle file not found: nope.yaml"
     assert message(find_world, "nope") == (
-        "no world named 'nope': give a YAML path or a bundled name (circle, five_spheres, sphere, wall)"
+        "no world named 'nope': give a YAML, .scene or URDF path or a bundled name "
+        "(circle, five_spheres, pillar, shelf, sphere, table_boxes, wall)"
     )
     for path, expected in (
         (tmp_path / "nope.yaml", f"robot spec not found: {tmp_path / 'nope.yaml'}"),

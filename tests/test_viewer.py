@@ -32,6 +32,9 @@ from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.viewer import check_trajectories, show, write_html
 from ppcbf_robots.viewer_page import PageServer
 from ppcbf_robots.viewer_shapes import drawable
+from ppcbf_robots.world import HalfSpace
+from ppcbf_robots.world_files.load import load_world
+from ppcbf_robots.world_shapes import coal_shape
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = [
@@ -221,6 +224,23 @@ def test_shapes_keep_their_size(shape: coal.ShapeBase) -> None:
     vertices = drawable(shape).vertices
     assert vertices.max(axis=0) == pytest.approx(shape.aabb_local.max_, rel=0.01)
     assert vertices.min(axis=0) == pytest.approx(shape.aabb_local.min_, rel=0.01)
+
+
+def test_every_kind_of_obstacle_is_drawn_where_it_stands(
+    browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path
+) -> None:
+    problem, trajectory = two_link
+    world = load_world(Path(__file__).parent / "data" / "worlds" / "ours.yaml")
+    assert {o.type for o in world.obstacles} == {"sphere", "half_space", "box", "capsule", "cylinder", "mesh"}
+    write_html(dataclasses.replace(problem, world=world), [trajectory], ["a"], tmp_path / "a.html")
+    browser.open((tmp_path / "a.html").as_uri())
+    assert browser.complaints == []
+    for o in world.obstacles:
+        node = f"viewer.scene_tree.find(['meshcat', 'obstacles', '{o.name}']).object"
+        assert browser.evaluate(f"{node}.children[0].geometry.attributes.position.count") > 0, o.name
+        if not isinstance(o, HalfSpace):
+            expected = coal_shape(o)[1][:3, 3]
+            assert browser.evaluate(f"{node}.position.toArray()") == pytest.approx(expected, abs=1e-6)
 
 
 def test_body_spheres_can_be_hidden(browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
