@@ -1,10 +1,10 @@
-"""How long one filter step takes, from (q, v) to torque, whole and by stage, on states where the QP has to be solved."""
+"""How long one filter step takes, from (q, v) to torque, whole and by stage, where the QP has to be solved."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from ppcbf_robots.network import NumpyNetwork, random_convex
 from ppcbf_robots.problem import Problem, Robot
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array
-from ppcbf_robots.world import Sphere, WorldSpec
+from ppcbf_robots.world import Obstacle, Sphere, WorldSpec
 
 STATES = 400  # different ones, cycled through
 STAGES = ("kinematics and dynamics", "geometry", "network", "QP")
@@ -51,12 +51,11 @@ class Case:
 def crowd(robot: Robot, pairs: int, seed: int = 0) -> Problem:
     """The robot among as many random balls as give about ``pairs`` pairs with its body."""
     rng = np.random.default_rng(seed)
-    balls = []
+    balls: list[Obstacle] = []
     while len(balls) < max(1, round(pairs / len(robot.body))):
         center = rng.normal(size=3)
         center *= rng.uniform(*REACH) / np.linalg.norm(center)
-        ball = Sphere(type="sphere", name=f"ball {len(balls)}", center=center.tolist(), radius=0.03)
-        balls.append(ball)
+        balls.append(Sphere(type="sphere", name=f"ball {len(balls)}", center=center.tolist(), radius=0.03))
     world = WorldSpec(obstacles=balls)
     return Problem(robot, f"{len(balls)} random balls", world, robot.safety(balls))
 
@@ -115,19 +114,18 @@ def _stages(
     steps: int,
 ) -> dict[str, float]:
     """Median time of each stage [µs], measured apart from the whole."""
-    model, times = problem.model, np.empty((steps, len(STAGES)))
+    model, clock = problem.model, time.perf_counter_ns
+    times = np.empty((steps, len(STAGES)))
     for i in range(steps):
         q, v, u_des, d_p = states[i % len(states)]
-        dyn, times[i, 0] = _timed(lambda q=q, v=v: model.evaluate(q, v))
-        rows, times[i, 1] = _timed(lambda dyn=dyn: problem.safety.evaluate(dyn))
-        phi, times[i, 2] = _timed(lambda dyn=dyn, rows=rows: barrier.rows(dyn, rows))
-        _, times[i, 3] = _timed(
-            lambda dyn=dyn, phi=phi, u=u_des, d=d_p: runtime.correction.correct(dyn, phi, u, d, model.u_max)
-        )
+        at = [clock()]
+        dyn = model.evaluate(q, v)
+        at.append(clock())
+        safety = problem.safety.evaluate(dyn)
+        at.append(clock())
+        rows = barrier.rows(dyn, safety)
+        at.append(clock())
+        runtime.correction.correct(dyn, rows, u_des, d_p, model.u_max)
+        at.append(clock())
+        times[i] = 1e-3 * np.diff(at)
     return dict(zip(STAGES, np.median(times, axis=0).tolist(), strict=True))
-
-
-def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    began = time.perf_counter_ns()
-    result = call()
-    return result, 1e-3 * (time.perf_counter_ns() - began)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from ppcbf_robots.kernels import kernel
 
 
@@ -64,3 +66,59 @@ def condense(
         if k < R and lower[k] > center + reach + tolerance and (hopeless < 0 or lower[k] > worst):
             hopeless, worst = k, lower[k]
     return hopeless, hold
+
+
+@kernel
+def pick(C: Any, lower: Any, chosen: Any, row: Any, bound: float, with_row: bool) -> tuple[Any, Any]:
+    """The chosen rows and their bounds in arrays of their own, with one more row (nv,) at the end if asked for."""
+    count, nv = len(chosen), C.shape[1]
+    rows, bounds = np.empty((count + (1 if with_row else 0), nv)), np.empty(count + (1 if with_row else 0))
+    for i in range(count):
+        bounds[i] = lower[chosen[i]]
+        for j in range(nv):
+            rows[i, j] = C[chosen[i], j]
+    if with_row:
+        bounds[count] = bound
+        for j in range(nv):
+            rows[count, j] = row[j]
+    return rows, bounds
+
+
+@kernel
+def nearest(lower: Any, binding: Any, count: int) -> Any:
+    """Indices, rising, of the ``count`` binding rows most in need of a correction; row 0 if none binds."""
+    found = np.flatnonzero(binding)
+    if len(found) > count:
+        found = np.sort(found[np.argsort(-lower[found])[:count]])
+    return found if len(found) > 0 else np.zeros(1, dtype=np.int64)
+
+
+@kernel
+def verify(C: Any, lower: Any, binding: Any, z: Any, tolerance: float, missed: Any) -> tuple[int, int, float]:
+    """Check a correction against all rows: (number of rows missed, row of least residual, that residual).
+
+    A row is missed if it binds and falls short by more than ``tolerance max(1, |lower|)``; missed (rows,) is filled.
+    """
+    count, tightest, least = 0, -1, np.inf
+    for k in range(len(lower)):
+        residual = -lower[k]
+        for j in range(len(z)):
+            residual += C[k, j] * z[j]
+        missed[k] = binding[k] and not residual >= -tolerance * max(1.0, abs(lower[k]))
+        count += missed[k]
+        if residual < least:
+            tightest, least = k, residual
+    return count, tightest, least
+
+
+@kernel
+def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
+    """``W`` in the dimensionless correction, M⁻¹ or 1 scaled by u_max on both sides, with mean diagonal 1."""
+    n = len(u_max)
+    H, trace = np.zeros((n, n)), 0.0
+    for i in range(n):
+        for j in range(n):
+            if kinetic or i == j:
+                H[i, j] = (Minv[i, j] if kinetic else 1.0) * u_max[i] * u_max[j]
+        trace += H[i, i]
+    return H * (n / trace)

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.condense import condense
+from ppcbf_robots.condense import condense, hessian, nearest, pick, verify
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
-from ppcbf_robots.robot import Dynamics
+from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array
 
@@ -27,10 +27,12 @@ FilterKind = Literal["closed-form", "qp"]
 
 Row = tuple[Array, float]  # (n,) of length 1 and its lower bound
 Box = tuple[Array, Array]  # (n,) bounds of the dimensionless correction
+Solution = tuple[Array, int]  # dimensionless correction and the row that it rests on, -1 if none
 
 _TINY = 1e-12
 _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
+TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
@@ -92,13 +94,6 @@ class QPRows:
     norm: Array  # (rows,) length before, in units of phi̇ per full torque
     binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
     barrier_rows: int
-
-    def nearest(self, count: int) -> NDArray[np.int64]:
-        """Indices of the rows most in need of a correction, rising; at least one."""
-        found = np.flatnonzero(self.binding)
-        if len(found) > count:
-            found = np.sort(found[np.argsort(-self.lower[found], kind="stable")[:count]])
-        return found if len(found) else np.zeros(1, dtype=np.int64)
 
 
 class ClosedForm:
@@ -162,6 +157,11 @@ class ClosedForm:
         return Correction(u_des + damped(high)[1], Status.CORRECTING, "psi(u_des) < -gamma_K phi", k)
 
 
+def is_slow(robot: RobotModel, v: Array) -> bool:
+    """Whether every joint is slower than NEAR_REST of its limit."""
+    return bool((np.abs(v) <= NEAR_REST * robot.v_max).all())
+
+
 class QPFilter:
     """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
 
@@ -198,24 +198,17 @@ class QPFilter:
             z = self._least_violation(dyn, qp, box, u_max)
             return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, hopeless)
         passivity = self._passivity_row(dyn, d_p, u_max)
-        z = self._solve(dyn, qp, passivity, box, u_max)
-        if z is not None:
-            k = self._tightest(qp, z)
-            return self._answer(z, u_des, u_max, Status.CORRECTING, "constraint active", k)
+        solved = self._solve(dyn, qp, passivity, box, u_max)
+        if solved is not None:
+            return self._answer(solved[0], u_des, u_max, Status.CORRECTING, "constraint active", solved[1])
         if passivity is not None:
-            z = self._solve(dyn, qp, None, box, u_max)
-        if z is not None:
-            k = self._tightest(qp, z)
-            return self._answer(z, u_des, u_max, Status.PASSIVITY_DROPPED, "rows and box allow no passive torque", k)
+            solved = self._solve(dyn, qp, None, box, u_max)
+        if solved is not None:
+            reason = "rows and box allow no passive torque"
+            return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
         z = self._least_violation(dyn, qp, box, u_max)
         k = int(np.argmax(qp.lower[: qp.barrier_rows]))
         return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
-
-    @staticmethod
-    def _tightest(qp: QPRows, z: Array) -> int:
-        residual = qp.C @ z - qp.lower
-        k = int(np.argmin(residual))
-        return k if residual[k] < 1e-4 else -1
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p as (row, lower) of length 1; None near rest.
@@ -223,36 +216,34 @@ class QPFilter:
         There the direction of v is noise, and a milliwatt would be bought with full torque on joints that hardly move;
         the kinetic metric's correction takes energy out without the row.
         """
-        if d_p is None or np.all(np.abs(dyn.v) <= NEAR_REST * self.safety.robot.v_max):
+        if d_p is None or is_slow(self.safety.robot, dyn.v):
             return None
         row = -dyn.v * u_max
         norm = float(np.sqrt(row @ row))
         return row / norm, -d_p / norm
 
     def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
-        H = np.diag(u_max**2) if self.config.metric == "torque" else dyn.Minv * u_max * u_max[:, None]
-        return np.asarray(H * (len(u_max) / H.trace()))
+        return np.asarray(hessian(dyn.Minv, u_max, self.config.metric == "kinetic"))
 
-    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, box: Box, u_max: Array) -> Array | None:
+    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, box: Box, u_max: Array) -> Solution | None:
         """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
-        H = self._hessian(dyn, u_max)
-        chosen = qp.nearest(self.config.near_rows)
-        slack_of = ROW_TOLERANCE * np.maximum(1.0, np.abs(qp.lower))
+        H, no_row = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0)
+        chosen = nearest(qp.lower, qp.binding, self.config.near_rows)
+        missed = np.empty(len(qp.lower), dtype=np.bool_)
         for _ in range(4):
-            rows, bounds, allowed = qp.C[chosen], qp.lower[chosen], slack_of[chosen]
-            if passivity is not None:
-                rows, bounds = np.vstack([rows, passivity[0]]), np.append(bounds, passivity[1])
-                allowed = np.append(allowed, ROW_TOLERANCE)
+            rows, bounds = pick(qp.C, qp.lower, chosen, *(passivity or no_row), passivity is not None)
             z = self._ask(QPProblem(H, np.zeros(len(H)), rows, bounds, *box))
             if z is None:
                 return None
             z = np.minimum(np.maximum(z, box[0]), box[1])
-            if np.any(rows @ z < bounds - allowed):
+            if passivity is not None and not passivity[0] @ z >= passivity[1] - ROW_TOLERANCE:
                 return None
-            missed = np.flatnonzero(qp.binding & (qp.C @ z < qp.lower - slack_of))
-            if not missed.size:
-                return z
-            chosen = np.union1d(chosen, missed)
+            count, tightest, least = verify(qp.C, qp.lower, qp.binding, z, ROW_TOLERANCE, missed)
+            if count == 0:
+                return z, tightest if least < TIGHT else -1
+            if missed[chosen].any():
+                return None  # the solver claims what does not hold
+            chosen = np.union1d(chosen, np.flatnonzero(missed))
         return None
 
     def _least_violation(self, dyn: Dynamics, qp: QPRows, box: Box, u_max: Array) -> Array | None:
@@ -262,10 +253,12 @@ class QPFilter:
         """
         n = len(u_max)
         steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
+        if not len(steerable):
+            return np.clip(np.zeros(n), *box)
         C, lower = qp.C[steerable], qp.lower[steerable]
         reach = np.maximum(C * box[0], C * box[1]).sum(-1)
         lower = np.minimum(lower, reach)  # each row falls short by what is out of its own reach in any case
-        near = np.sort(np.argsort(-lower, kind="stable")[: self.config.near_rows])
+        near = nearest(lower, np.ones(len(lower), dtype=np.bool_), self.config.near_rows)
         H = np.zeros((n + 1, n + 1))
         H[:n, :n] = self._hessian(dyn, u_max)
         H[n, n] = LEAST_VIOLATION_WEIGHT

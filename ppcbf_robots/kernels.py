@@ -25,13 +25,14 @@ Vector = tuple[float, float, float]
 Core = tuple[float, float, float, float, float]  # distance, second order term, gradient
 
 SPHERE, HALF_SPACE, BOX, CAPSULE, CYLINDER, MESH = range(6)
+FAST_MATH = {"reassoc", "contract"}  # lets sums be vectorised; NaN and infinity keep their meaning
 _TINY = 1e-9  # [m], below which the direction away from a centre is not defined
 _NEGLIGIBLE = -40.0  # exponent of a plane's weight below which it does not count
 
 
 def kernel(function: F) -> F:
     """Compile with numba; the machine code is cached beside the source, or in the user's cache folder."""
-    return cast(F, numba.njit(cache=True, error_model="numpy")(function))
+    return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=FAST_MATH)(function))
 
 
 @kernel

@@ -14,10 +14,13 @@ Two forms:
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
+
+from ppcbf_robots import network_kernel
 
 NetworkKind = Literal["mlp", "convex"]
 Params = Mapping[str, Any]
@@ -129,21 +132,40 @@ class NumpyNetwork:
     def __init__(self, kind: NetworkKind, params: Mapping[str, Any]) -> None:
         self.kind: NetworkKind = kind
         self.params = {k: np.asarray(w, dtype=np.float64) for k, w in params.items()}
+        self._packed: tuple[Any, ...] | None = None
 
     def value(self, q: Any, v: Any) -> Any:
         """K (...) alone, for q (..., nq) and v (..., nv)."""
         return value_along(np, self.kind, self.params, q, v)(np.ones(np.shape(v)[:-1]))
 
     def value_and_grad(self, q: Any, v: Any) -> tuple[Any, Any, Any]:
-        """See :func:`value_and_grad`."""
-        return value_and_grad(np, self.kind, self.params, q, v)
+        """See :func:`value_and_grad`; a single state is evaluated compiled, ten times faster."""
+        if np.ndim(v) > 1:
+            return value_and_grad(np, self.kind, self.params, q, v)
+        if self._packed is None:
+            self._packed = self._pack()
+        form = network_kernel.mlp if self.kind == "mlp" else network_kernel.convex
+        K, K_q, K_v = form(q, v, *self._packed)
+        return np.float64(K), K_q, K_v
+
+    def _pack(self) -> tuple[Any, ...]:
+        """Arguments of the compiled form behind q and v."""
+        p = self.params
+        layers = [(p[f"W{i}"], p[f"b{i}"]) for i in range(sum(f"W{i}" in p for i in range(len(p))))]
+        weights = np.concatenate([x.ravel() for layer in layers for x in layer])
+        widths = np.array([len(layers[0][0]), *(len(b) for _, b in layers)])
+        common = weights, widths, p["in_shift"], p["in_scale"]
+        if self.kind == "mlp":
+            return *common, p["w_out"], float(p["b_out"]), float(p["zero_at_rest"])
+        heads = (np.ascontiguousarray(p[f"W{k}"].T) if w else p[f"b{k}"] for k in "abc" for w in (True, False))
+        return *common, p["v_scale"], *heads
 
 
 def random_convex(nq: int, nv: int, hidden: tuple[int, ...], units: int, rng: np.random.Generator) -> dict[str, Any]:
     """Small random parameters of the convex form; for benchmarks and examples, not a barrier to rely on."""
     widths = (nq, *hidden)
     params: dict[str, Any] = {"in_shift": np.zeros(nq), "in_scale": np.ones(nq), "v_scale": np.ones(nv)}
-    for i, (a, b) in enumerate(zip(widths, widths[1:], strict=False)):
+    for i, (a, b) in enumerate(itertools.pairwise(widths)):
         params |= {f"W{i}": rng.normal(0.0, a**-0.5, (a, b)), f"b{i}": np.zeros(b)}
     for name, outputs, bias in (("a", units, -4.0), ("b", units * nv, 0.0), ("c", units, -1.0)):
         params |= {f"W{name}": rng.normal(0.0, 0.1, (widths[-1], outputs)), f"b{name}": np.full(outputs, bias)}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+import daqp
 import numpy as np
 from proxsuite import proxqp
 
@@ -15,6 +16,8 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.specs import Array
 
 NO_BOUND = 1e20  # ProxQP's infinity
+DAQP_NO_BOUND = 1e30  # DAQP's
+DAQP_OPTIMAL = 1  # its exit flag
 
 
 class QPProblem(NamedTuple):
@@ -80,6 +83,19 @@ class ProxQPSolver:
         return np.array(qp.results.x)
 
 
+class DAQPSolver:
+    """DAQP, a dense dual active-set solver: exact to rounding, and it tells infeasible problems."""
+
+    def solve(self, problem: QPProblem) -> Array | None:
+        """(n,) solution, or None unless DAQP ends with an optimum."""
+        m, n = problem.C.shape
+        upper, lower = np.empty(n + m), np.empty(n + m)
+        upper[:n], upper[n:] = problem.box_high, DAQP_NO_BOUND
+        lower[:n], lower[n:] = problem.box_low, problem.lower
+        x, _, exit_flag, _ = daqp.solve(problem.H, problem.g, problem.C, upper, lower, np.zeros(n + m, dtype=np.int32))
+        return np.asarray(x) if exit_flag == DAQP_OPTIMAL else None
+
+
 class QPSolversSolver:
     """Any dense solver installed for the qpsolvers package, by name (``daqp``, ``quadprog``, ...)."""
 
@@ -103,5 +119,8 @@ class QPSolversSolver:
 
 
 def make_solver(name: str) -> QPSolver:
-    """``proxqp`` directly through proxsuite, everything else through qpsolvers."""
-    return ProxQPSolver() if name == "proxqp" else QPSolversSolver(name)
+    """``daqp`` and ``proxqp`` through their own interfaces, everything else through qpsolvers."""
+    return DIRECT[name]() if name in DIRECT else QPSolversSolver(name)
+
+
+DIRECT: dict[str, type[DAQPSolver | ProxQPSolver]] = {"daqp": DAQPSolver, "proxqp": ProxQPSolver}

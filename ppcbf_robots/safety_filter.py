@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import NEAR_REST, ClosedForm, FilterConfig, QPFilter, Status
+from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array
@@ -99,11 +100,8 @@ class SafetyFilter:
         rows = self.barrier.rows(dyn, self.safety.evaluate(dyn))
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
-        usable = u_des.shape == (self.robot.nv,) and bool(np.all(np.isfinite(u_des + offset)))
-        usable = (
-            usable and (d_p is None or np.isfinite(d_p)) and bool(np.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum()))
-        )
-        if not usable:
+        wanted = (u_des @ u_des if u_des.shape == (self.robot.nv,) else np.nan) + (d_p or 0.0)
+        if not math.isfinite(wanted + rows.Lf_phi @ rows.Lf_phi + np.vdot(rows.Lg_phi, rows.Lg_phi)):
             u = self._fallback(dyn) - offset
             return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")
         c = self.correction.correct(dyn, rows, u_des + offset, d_p, self.robot.u_max)
@@ -120,8 +118,7 @@ class SafetyFilter:
 
     def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
         """Hardly any speed, now and RESTING_TIME ahead under u."""
-        ahead = dyn.v + RESTING_TIME * dyn.Minv @ (u - dyn.b)
-        return bool(np.all(np.maximum(np.abs(dyn.v), np.abs(ahead)) <= NEAR_REST * self.robot.v_max))
+        return is_slow(self.robot, dyn.v) and is_slow(self.robot, dyn.v + RESTING_TIME * dyn.Minv @ (u - dyn.b))
 
     def _name(self, row: int) -> str:
         return self.safety.names[row] if row >= 0 else ""
@@ -131,10 +128,10 @@ class SafetyFilter:
             return f"state of shape {q.shape}, {v.shape} instead of ({self.robot.nq},), ({self.robot.nv},)"
         if not isinstance(t, int | float | np.number) or not np.isfinite(t):
             return "time not a finite number"
-        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+        if not math.isfinite(q @ q + v @ v):
             return "state not finite"
         c = self.robot.idx_q[self.robot.continuous]
-        if np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):
+        if len(c) and np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):
             return "a continuous joint's (cos, sin) is not of length 1"
         if self._last is not None and t < self._last[0]:
             return f"time went backwards, from {self._last[0]:g} s to {t:g} s"

@@ -14,6 +14,7 @@ import pytest
 LAYERS = [
     ["errors"],
     ["specs", "resources", "kernels"],
+    ["network_kernel"],
     ["urdf", "world", "body"],
     ["shapes", "world_shapes"],
     ["robot", "world_files"],
@@ -33,6 +34,7 @@ OWNERS = {
     "numba": ["kernels"],
     "scipy": ["shapes"],
     "proxsuite": ["qp"],
+    "daqp": ["qp"],
     "qpsolvers": ["qp"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
