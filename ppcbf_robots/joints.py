@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.specs import Array, PerJoint, per_joint
-from ppcbf_robots.urdf_parts import JointFacts
+from ppcbf_robots.urdf_parts import JointFacts, least_eigenvalue
 
 MAX_MOVING = 8  # joints; beyond, sampling the domain says little
 GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|claw", re.IGNORECASE)
@@ -49,7 +49,7 @@ def locked_joints(
         held = _held_by_default(model, facts, locked, warnings)
     left = [n for n in names if n not in held]
     if not left:
-        raise InputError(f"{path}: no joint moves; check 'locked', 'moving' and the joint types")
+        raise InputError(f"{path}: no joint moves; check 'locked' and the joint types")
     if len(left) > MAX_MOVING:
         shown = ", ".join(left[:30]) + (", ..." if len(left) > 30 else "")
         raise InputError(
@@ -114,6 +114,29 @@ def _resting(name: str, facts: Facts, locked: Mapping[str, float]) -> float:
     return position
 
 
+def lock(
+    model: pin.Model, held: Mapping[str, float], geometries: Sequence[pin.GeometryModel] = ()
+) -> tuple[pin.Model, list[pin.GeometryModel]]:
+    """The model, and geometries of it, with the held joints fixed in place."""
+    if not held:
+        return model, list(geometries)
+    ids = [model.getJointId(n) for n in held]
+    model = model.copy()
+    _rename_links(model, set(held), "", _TWIN)  # Pinocchio looks joints up among all frames and wants one hit
+    reduced, kept = pin.buildReducedModel(model, list(geometries), ids, reference(model, held))
+    _rename_links(reduced, {n + _TWIN for n in held}, _TWIN, "")
+    return reduced, list(kept)
+
+
+_TWIN = " (link)"
+
+
+def _rename_links(model: pin.Model, names: set[str], old_end: str, new_end: str) -> None:
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY and frame.name in names:
+            frame.name = frame.name.removesuffix(old_end) + new_end
+
+
 def reference(model: pin.Model, held: Mapping[str, float]) -> Array:
     """Configuration (nq,) of the full model with the held joints in place and the others at neutral."""
     q = pin.neutral(model)
@@ -121,6 +144,20 @@ def reference(model: pin.Model, held: Mapping[str, float]) -> Array:
         j = model.joints[model.getJointId(name)]
         q[j.idx_q : j.idx_q + j.nq] = [np.cos(position), np.sin(position)] if j.nq == 2 else [position]
     return np.asarray(q)
+
+
+def check_inertias(path: Path, model: pin.Model) -> None:
+    """Refuse a moving link whose inertia, with the links fixed to it, has a negative eigenvalue.
+
+    A small fixed link whose inertia makes no sense does no harm beside the others; several real URDFs have one.
+    """
+    for joint in range(1, model.njoints):
+        least = least_eigenvalue(model.inertias[joint].inertia)
+        if least < 0.0:
+            raise InputError(
+                f"{path}: the link moved by joint '{model.names[joint]}' has an inertia with the negative eigenvalue "
+                f"{least:.3g}; its products of inertia are too large, correct them in the URDF"
+            )
 
 
 def force_limits(
@@ -131,20 +168,25 @@ def force_limits(
     Raises:
         InputError: asking for all that is missing at once.
     """
-    found, missing, remedies = [], [], []
+    found, missing = [], dict[str, list[str]]()
     for what, override in (("effort", effort), ("velocity", velocity)):
         limits = np.array([getattr(facts[n], what) for n in names])
         if override is not None:
             limits = per_joint(override, names, what, default=limits)
-        wrong = [i for i in range(len(names)) if not limits[i] > 0.0]
+        wrong = [(n, x) for n, x in zip(names, limits, strict=True) if not x > 0.0]
         if wrong:
-            missing.append(f"{_listed([names[i] for i in wrong])} no usable {what} limit (got {limits[wrong[0]]:g})")
-            remedies.append(f"`{what}: {{{', '.join(f'{names[i]}: {HINT[what]}' for i in wrong)}}}`")
+            missing[what] = [n for n, _ in wrong]
+            got = wrong[0][1]
         found.append(limits)
     if missing:
+        joints = list(dict.fromkeys(n for listed in missing.values() for n in listed))
+        remedy = " and ".join(
+            f"`{what}: {{{', '.join(f'{n}: {HINT[what]}' for n in listed)}}}`" for what, listed in missing.items()
+        )
         raise InputError(
-            f"{path}: {' and '.join(missing)}; give {'one' if len(missing) == 1 else 'them'} in a robot spec, "
-            f"e.g. {' and '.join(remedies)}, or lock the joint"
+            f"{path}: {_listed(joints)} no usable {' and '.join(missing)} limit (got {got:g}); "
+            f"give {'one' if len(joints) == len(missing) == 1 else 'them'} in a robot spec, e.g. {remedy}, "
+            "or lock the joint"
         )
     return found[0], found[1]
 
@@ -177,7 +219,7 @@ def position_limits(
             )
         if free and facts[n].kind == "revolute":
             warnings.append(f"joint '{n}' has no position limits: taken to turn freely, half a turn either way in X")
-        elif max(abs(x) for x in (lower, upper) if np.isfinite(x)) > 8.0 * np.pi and facts[n].kind == "revolute":
+        elif facts[n].kind == "revolute" and any(8.0 * np.pi < abs(x) < np.inf for x in (lower, upper)):
             warnings.append(f"joint '{n}' turns from {lower:g} to {upper:g} rad; are these degrees?")
     return np.array([x for x, _ in limits.values()]), np.array([x for _, x in limits.values()])
 

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, tostring
 
 import coal
 import numpy as np
+import pinocchio as pin
+
+from ppcbf_robots.joints import lock
+from ppcbf_robots.specs import Array
 
 MAX_BYTES = 50_000_000
 MAX_TRIANGLES = 1_000_000
@@ -26,21 +30,34 @@ class Meshes:
     Args:
         urdf: path of the URDF, from whose folder relative names start.
         package_dirs: folders that hold packages, or are one.
+        root: the clean ``<robot>`` of :class:`ppcbf_robots.urdf.UrdfFacts`.
     """
 
-    def __init__(self, urdf: Path, package_dirs: Sequence[Path]) -> None:
-        self.urdf, self.package_dirs = urdf, package_dirs
+    def __init__(self, urdf: Path, package_dirs: Sequence[Path], root: Element) -> None:
+        self.urdf, self.package_dirs, self.root = urdf, package_dirs, root
         self.loader = coal.CachedMeshLoader()
         self._known: dict[tuple[str, str], tuple[Path | None, str]] = {}
 
-    def resolved(self, root: Element, kind: str) -> tuple[Element, dict[str, str]]:
-        """A copy of the clean ``<robot>`` with absolute mesh paths, and what is wrong by link.
+    def geometry(
+        self, kind: pin.GeometryType, full_model: pin.Model, locked: Mapping[str, float]
+    ) -> tuple[pin.GeometryModel, dict[str, str]]:
+        """Shapes of one kind with the locked joints fixed, and by link what is wrong with a mesh of it.
 
-        Args:
-            root: the robot of :class:`ppcbf_robots.urdf.UrdfFacts`.
-            kind: 'visual' or 'collision'; the other kind is taken out. Shapes whose mesh cannot be read are, too.
+        Of collision geometry a moving joint keeps all or nothing, lest half of a link pass for the whole.
         """
-        root, wrong = copy.deepcopy(root), dict[str, str]()
+        root, wrong = self._resolved("collision" if kind == pin.GeometryType.COLLISION else "visual")
+        xml = tostring(root, encoding="unicode")
+        full = pin.buildGeomFromUrdfString(full_model, xml, kind, None, [], self.loader)
+        model, (shapes,) = lock(full_model, locked, [full])
+        if kind == pin.GeometryType.COLLISION:
+            joints = {model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint for link in wrong}
+            for name in [o.name for o in shapes.geometryObjects if o.parentJoint in joints]:
+                shapes.removeGeometryObject(name)
+        return shapes, wrong
+
+    def _resolved(self, kind: str) -> tuple[Element, dict[str, str]]:
+        """A copy of the robot with the shapes of one kind, absolute mesh paths, and without the unreadable meshes."""
+        root, wrong = copy.deepcopy(self.root), dict[str, str]()
         for link in root.findall("link"):
             for shape in link.findall("visual") + link.findall("collision"):
                 mesh = shape.find("geometry/mesh")
@@ -64,18 +81,13 @@ class Meshes:
             self._known[name, scale] = path, f"'{name}' {problem}" if problem else ""
         return self._known[name, scale]
 
-    def _load(self, path: Path, scale: np.ndarray) -> str:
+    def _load(self, path: Path, scale: Array) -> str:
         try:
             vertices = np.asarray(self.loader.load(str(path), scale).vertices())
         except (ValueError, RuntimeError):
             return "cannot be read"
         size = float(np.abs(vertices).max(initial=0.0)) if np.all(np.isfinite(vertices)) else np.inf
         return "" if size <= MAX_SIZE else f"reaches {size:.3g} m from its origin; check its scale"
-
-
-def mesh_xml(root: Element) -> str:
-    """The text that Pinocchio's geometry builder reads."""
-    return tostring(root, encoding="unicode")
 
 
 def find_mesh(name: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:

@@ -16,8 +16,8 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.joints import force_limits, locked_joints, position_limits, reference
-from ppcbf_robots.meshes import Meshes, mesh_xml
+from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits
+from ppcbf_robots.meshes import Meshes
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, vector
 from ppcbf_robots.urdf import check_urdf
 
@@ -137,11 +137,9 @@ class RobotModel:
             raise InputError(f"{self.urdf}: Pinocchio cannot read it ({' '.join(str(error).split())})") from None
         if self.full_model.nv == 0:
             raise InputError(f"{self.urdf}: no joint moves; check the joint types")
-        self._root, self._meshes = facts.root, Meshes(self.urdf, self.package_dirs)
+        self._meshes = Meshes(self.urdf, self.package_dirs, facts.root)
         self.locked = locked_joints(self.urdf, self.full_model, facts.joints, locked or {}, moving, self.warnings)
-        self.reference = reference(self.full_model, self.locked)
-        ids = [self.full_model.getJointId(n) for n in self.locked]
-        self.model = pin.buildReducedModel(self.full_model, ids, self.reference) if ids else self.full_model
+        self.model = lock(self.full_model, self.locked)[0]
         self.joint_names = list(self.model.names)[1:]
         if payload is not None:
             self._add_payload(payload)
@@ -273,34 +271,20 @@ class RobotModel:
     def geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
         """Visual or collision geometry of the reduced model; ValueError if Pinocchio cannot build it.
 
-        Shapes whose mesh cannot be read are left out with a warning. Of collision geometry a joint then keeps none, lest
-        half of a link pass for all of it.
+        Shapes whose mesh cannot be read are left out with a warning.
         """
         what = "collision" if kind == pin.GeometryType.COLLISION else "visual"
-        root, wrong = self._meshes.resolved(self._root, what)
+        shapes, wrong = self._meshes.geometry(kind, self.full_model, self.locked)
         if wrong:
-            self._warn_of_meshes(what, wrong)
-        full = pin.buildGeomFromUrdfString(
-            self.full_model, mesh_xml(root), kind, None, self.urdf.anchor or ".", self._meshes.loader
-        )
-        if self.locked:
-            ids = [self.full_model.getJointId(n) for n in self.locked]
-            full = pin.buildReducedModel(self.full_model, [full], ids, self.reference)[1][0]
-        if what == "collision":
-            joints = {self.model.frames[self.frame_id(link)].parentJoint for link in wrong}
-            for name in [o.name for o in full.geometryObjects if o.parentJoint in joints]:
-                full.removeGeometryObject(name)
-        return full
-
-    def _warn_of_meshes(self, what: str, wrong: dict[str, str]) -> None:
-        link, problem = next(iter(wrong.items()))
-        more = f", and {len(wrong) - 1} more links have such a mesh" if len(wrong) > 1 else ""
-        warning = f"link '{link}' lacks {what} geometry: the mesh {problem}{more}"
-        if warning not in self.warnings:
-            self.warnings.append(warning)
+            link, problem = next(iter(wrong.items()))
+            more = f", and {len(wrong) - 1} more links have such a mesh" if len(wrong) > 1 else ""
+            warning = f"link '{link}' lacks {what} geometry: the mesh {problem}{more}"
+            self.warnings += [] if warning in self.warnings else [warning]
+        return shapes
 
     def check_mass_matrix(self, angles: Array) -> None:
         """Refuse a mass matrix that is not positive definite at any of ``angles`` (B, nv)."""
+        check_inertias(self.urdf, self.model)
         for q in self.from_angles(angles):
             M = np.triu(pin.crba(self.model, self.data, q))
             M = M + np.triu(M, 1).T

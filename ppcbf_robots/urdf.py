@@ -53,6 +53,7 @@ def check_urdf(path: Path) -> UrdfFacts:
         raise InputError(f"{path}: {len(links)} links; at most {MAX_LINKS} are read")
     link_names = _names(path, links)
     _names(path, joints)
+    _check_tree(path, joints, link_names)
     clean = ElementTree.Element("robot", name=root.get("name") or path.stem)
     facts = {}
     for joint in joints:
@@ -60,9 +61,8 @@ def check_urdf(path: Path) -> UrdfFacts:
         clean.append(element)
         if fact is not None:
             facts[fact.name] = fact
-    _check_tree(path, joints, link_names)
     warnings: list[str] = []
-    clean.extend(clean_link(path, link, warnings) for link in links)
+    clean.extend([clean_link(path, link, warnings) for link in links])
     return UrdfFacts(str(clean.get("name")), facts, clean, warnings)
 
 

@@ -10,10 +10,12 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.specs import Array
 
 MOST_LENGTH = 100.0  # [m]; farther than any arm reaches
 MOST = 1e6  # of any other number: kg, kg m², rad, mesh scale
 UNSPECIFIED = 1e9  # efforts and velocities from here on say "no limit known"
+ROUNDING = 1e-12  # [kg m²]; exporters leave such negative moments
 INERTIA_FLOOR = -1e-3  # least eigenvalue of an inertia over its largest that passes as rounding
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 SHAPES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1},
@@ -138,7 +140,11 @@ def _inertial(path: Path, inertial: Element, link: Element, name: str, warnings:
     inertia = inertial.find("inertia")
     given = {} if inertia is None else inertia.attrib
     moments = {k: number(path, given.get(k) or "0", f"link '{name}', inertia {k}") for k in MOMENTS}
-    _check_moments(path, name, moments)
+    for k in ("ixx", "iyy", "izz"):
+        if moments[k] < -ROUNDING:
+            raise InputError(
+                f"{path}: link '{name}': the moment of inertia {k} is {moments[k]}; it must not be negative"
+            )
     if mass > 0.0 and inertia is None:
         warnings.append(f"link '{name}' has a mass but no <inertia>: taken as a point mass")
     new = SubElement(link, "inertial")
@@ -147,18 +153,10 @@ def _inertial(path: Path, inertial: Element, link: Element, name: str, warnings:
     SubElement(new, "inertia", {k: repr(x) for k, x in moments.items()})
 
 
-def _check_moments(path: Path, name: str, m: dict[str, float]) -> None:
-    """Kinetic energy must not become negative in any direction of rotation."""
-    for k in ("ixx", "iyy", "izz"):
-        if m[k] < 0.0:
-            raise InputError(f"{path}: link '{name}': the moment of inertia {k} is {m[k]}; it must not be negative")
-    matrix = [[m["ixx"], m["ixy"], m["ixz"]], [m["ixy"], m["iyy"], m["iyz"]], [m["ixz"], m["iyz"], m["izz"]]]
-    values = np.linalg.eigvalsh(np.array(matrix))
-    if values[0] < INERTIA_FLOOR * abs(values[-1]):
-        raise InputError(
-            f"{path}: link '{name}': the inertia matrix has the negative eigenvalue {values[0]:.3g}; "
-            "its products of inertia are too large for its moments, correct them"
-        )
+def least_eigenvalue(inertia: Array) -> float:
+    """Least eigenvalue of an inertia matrix (3, 3) [kg m²]; what may be rounding counts as 0."""
+    values = np.linalg.eigvalsh(inertia)
+    return float(values[0]) if values[0] < INERTIA_FLOOR * abs(values[-1]) - ROUNDING else max(float(values[0]), 0.0)
 
 
 def _shape(path: Path, shape: Element, link: Element, where: str) -> None:

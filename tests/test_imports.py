@@ -14,7 +14,8 @@ import pytest
 LAYERS = [
     ["errors"],
     ["specs", "resources"],
-    ["urdf", "world", "body"],
+    ["urdf", "urdf_parts", "world", "body"],
+    ["joints", "meshes"],
     ["robot"],
     ["safety", "controllers", "network"],
     ["barriers", "derive", "qp"],
