@@ -36,8 +36,9 @@ class Domain:
 
 def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
     """Given bounds, else the URDF's position limits (half a turn where there are none) and ± the velocity limits."""
-    lower = np.where(np.isfinite(robot.q_lower), robot.q_lower, -WIDE_TURN)
-    upper = np.where(np.isfinite(robot.q_upper), robot.q_upper, WIDE_TURN)
+    low, high = robot.q_lower, robot.q_upper
+    lower = np.where(np.isfinite(low), low, np.minimum(-WIDE_TURN, high - 2.0 * WIDE_TURN))
+    upper = np.where(np.isfinite(high), high, np.maximum(WIDE_TURN, low + 2.0 * WIDE_TURN))
     q, v = np.stack([lower, upper], 1), np.stack([-robot.v_max, robot.v_max], 1)
     for name, given in (("q", spec.q), ("v", spec.v)):
         if given is not None and len(given) != robot.nv:

@@ -19,7 +19,8 @@ from ppcbf_robots.joints import lock
 from ppcbf_robots.specs import Array
 
 MAX_BYTES = 50_000_000
-MAX_TRIANGLES = 1_000_000
+MAX_TRIANGLES = 200_000  # five seconds of reading
+MAX_NODES = 1000  # of a Collada scene; its reader recurses into them and runs out of stack
 MAX_SIZE = 100.0  # [m], of a scaled mesh
 FORMATS = (".stl", ".dae", ".obj", ".ply")
 
@@ -84,7 +85,7 @@ class Meshes:
     def _load(self, path: Path, scale: Array) -> str:
         try:
             vertices = np.asarray(self.loader.load(str(path), scale).vertices())
-        except (ValueError, RuntimeError):
+        except (ValueError, RuntimeError, MemoryError):
             return "cannot be read"
         size = float(np.abs(vertices).max(initial=0.0)) if np.all(np.isfinite(vertices)) else np.inf
         return "" if size <= MAX_SIZE else f"reaches {size:.3g} m from its origin; check its scale"
@@ -116,24 +117,26 @@ def mesh_problem(path: Path) -> str:
     try:
         if path.stat().st_size > MAX_BYTES:
             return f"is larger than {MAX_BYTES // 10**6} MB; simplify it"
-        triangles = count_triangles(path)
+        content = path.read_bytes()
     except OSError as error:
         return f"cannot be read ({error.strerror})"
-    return f"has {triangles} triangles, more than {MAX_TRIANGLES}; simplify it" if triangles > MAX_TRIANGLES else ""
+    triangles = count_triangles(path.suffix.lower(), content)
+    if triangles > MAX_TRIANGLES:
+        return f"has {triangles} triangles, more than {MAX_TRIANGLES}; simplify it"
+    nodes = content.count(b"<node")
+    return f"has {nodes} nodes, more than {MAX_NODES}; merge them" if nodes > MAX_NODES else ""
 
 
-def count_triangles(path: Path) -> int:
-    """Triangles (or faces) that a mesh file announces, without building them."""
-    content = path.read_bytes()
-    match path.suffix.lower():
+def count_triangles(suffix: str, content: bytes) -> int:
+    """Triangles (or faces; of a PLY file the most numerous element) that a mesh announces, without building them."""
+    match suffix:
         case ".stl":
             binary = len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
             return (len(content) - 84) // 50 if binary else content.count(b"endfacet")
         case ".obj":
             return content.count(b"\nf ")
         case ".ply":
-            announced = re.search(rb"element\s+face\s+(\d{1,18})", content[:4096])
-            return int(announced[1]) if announced else 0
+            return max(map(int, re.findall(rb"element\s+\w+\s+(\d{1,18})", content[:65536])), default=0)
     found = re.findall(rb"<(?:triangles|polylist|polygons)\b[^>]{0,200}?\bcount=[\"'](\d{1,18})", content)
     return sum(map(int, found))
 

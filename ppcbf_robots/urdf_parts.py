@@ -14,7 +14,7 @@ from ppcbf_robots.specs import Array
 
 MOST_LENGTH = 100.0  # [m]; farther than any arm reaches
 MOST = 1e6  # of any other number: kg, kg m², rad, mesh scale
-UNSPECIFIED = 1e9  # efforts and velocities from here on say "no limit known"
+UNSPECIFIED = 1e9  # limits from here on say "no limit known"
 ROUNDING = 1e-12  # [kg m²]; exporters leave such negative moments
 INERTIA_FLOOR = -1e-3  # least eigenvalue of an inertia over its largest that passes as rounding
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -103,9 +103,11 @@ def _range(path: Path, joint: Element, name: str) -> tuple[float, float]:
     if low > high:
         remedy = "swap them" if None not in given else "a missing one counts as 0, so give both"
         raise InputError(f"{path}: joint '{name}': lower limit {low} is above upper limit {high}; {remedy}")
-    if low == math.inf or high == -math.inf:
+    if low >= UNSPECIFIED or high <= -UNSPECIFIED:
         raise InputError(f"{path}: joint '{name}': the limits {low} .. {high} leave no position; correct them")
-    return (-math.inf, math.inf) if low == high == 0.0 else (low, high)
+    if low == high == 0.0:
+        return -math.inf, math.inf
+    return -math.inf if low <= -UNSPECIFIED else low, math.inf if high >= UNSPECIFIED else high
 
 
 def _mimic(path: Path, joint: Element, name: str) -> Mimic | None:
@@ -128,7 +130,7 @@ def clean_link(path: Path, link: Element, warnings: list[str]) -> Element:
         _inertial(path, inertial, new, name, warnings)
     for kind in ("visual", "collision"):
         for shape in link.findall(kind):
-            _shape(path, shape, new, f"link '{name}'")
+            _shape(path, shape, new, f"link '{name}'", warnings)
     return new
 
 
@@ -159,7 +161,7 @@ def least_eigenvalue(inertia: Array) -> float:
     return float(values[0]) if values[0] < INERTIA_FLOOR * abs(values[-1]) - ROUNDING else max(float(values[0]), 0.0)
 
 
-def _shape(path: Path, shape: Element, link: Element, where: str) -> None:
+def _shape(path: Path, shape: Element, link: Element, where: str, warnings: list[str]) -> None:
     geometry = shape.find("geometry")
     for form in [] if geometry is None else list(geometry)[:1]:
         attributes = {}
@@ -174,7 +176,8 @@ def _shape(path: Path, shape: Element, link: Element, where: str) -> None:
                     raise InputError(f"{path}: {what}: {min(sizes)} is negative; correct it")
                 attributes[key] = _text(sizes)
         else:
-            raise InputError(f"{path}: {where}: unknown shape <{form.tag}>; write box, sphere, cylinder or mesh")
+            warnings.append(f"{where}: the unknown shape <{form.tag}> was left out")
+            continue
         new = SubElement(link, shape.tag)
         _origin(path, shape, new, where)
         SubElement(SubElement(new, "geometry"), form.tag, attributes)

@@ -43,16 +43,41 @@ ARM = f"""<robot name="arm">
 <mimic joint="elbow" multiplier="2" offset="0.1"/></joint>
 </robot>"""
 TETRAHEDRON = """solid t
-facet normal 0 0 0 outer loop vertex 0 0 0 vertex 0.1 0 0 vertex 0 0.1 0 endloop endfacet
-facet normal 0 0 0 outer loop vertex 0 0 0 vertex 0.1 0 0 vertex 0 0 0.1 endloop endfacet
-facet normal 0 0 0 outer loop vertex 0 0 0 vertex 0 0.1 0 vertex 0 0 0.1 endloop endfacet
-facet normal 0 0 0 outer loop vertex 0.1 0 0 vertex 0 0.1 0 vertex 0 0 0.1 endloop endfacet
+facet normal 0 0 0 
+outer loop
+vertex 0 0 0
+vertex 0.1 0 0
+vertex 0 0.1 0
+endloop
+endfacet
+facet normal 0 0 0 
+outer loop
+vertex 0 0 0
+vertex 0.1 0 0
+vertex 0 0 0.1
+endloop
+endfacet
+facet normal 0 0 0 
+outer loop
+vertex 0 0 0
+vertex 0 0.1 0
+vertex 0 0 0.1
+endloop
+endfacet
+facet normal 0 0 0 
+outer loop
+vertex 0.1 0 0
+vertex 0 0.1 0
+vertex 0 0 0.1
+endloop
+endfacet
 endsolid t
 """
 REAL = ["double_pendulum_continuous", "asr_twodof_description", "so101", "panda_collision"]
 VALUES = ["nan", "inf", "-inf", "-1", "0", "1e308", "1e-308", "1e9", "-0.5", "", " ", "x", "0x10", "1_0", "١", "1 2 3",
-          "0 0 0", "nan nan nan", "1e99 0 0", "base", "upper", "elbow", "universe", "fixed", "revolute", "floating",
-          "a" * 5000, "'\"><&", "\u202e\U0001f916", "package://", "file:///dev/zero", "../../../etc/passwd", "/", "."]  # fmt: skip
+          "0 0 0", "nan nan nan", "1e99 0 0", "base", "upper", "elbow", "universe", "fixed", "revolute", "floating", "a" * 5000,
+"'\"><&", "\u202e\U0001f916", "package://", "file:///dev/zero", "../../etc/passwd",
+          "/", "."]  # fmt: skip
 FUZZ = settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -120,3 +145,201 @@ def test_mutated_urdfs(tmp_path, text):
     path.write_text(text, encoding="utf-8")
     (tmp_path / "fore.stl").write_text(TETRAHEDRON)
     model_or_refusal(path, effort=10.0, velocity=2.0)
+
+
+@pytest.mark.parametrize("old", ["0.5", "0.002", "0.0001", "-2", "20", "0 1 0", "0.4 0 0", '"2"', "0.02", "1 1 1"])
+def test_every_absurd_value_in_every_kind_of_number(tmp_path, old):
+    (tmp_path / "fore.stl").write_text(TETRAHEDRON)
+    path = tmp_path / "arm.urdf"
+    for value in VALUES:
+        new = value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+        assert old in ARM
+        path.write_text(ARM.replace(old, f'"{new}"' if old.startswith('"') else new, 1), encoding="utf-8")
+        model_or_refusal(path, effort=10.0, velocity=2.0)
+
+
+def test_the_arm_itself_works(tmp_path):
+    """Or the mutations would show nothing."""
+    (tmp_path / "fore.stl").write_text(TETRAHEDRON)
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM)
+    model = model_or_refusal(path)
+    assert isinstance(model, RobotModel)
+    assert model.joint_names == ["pan", "elbow"]
+    assert model.locked == {"slider": 0.1}  # twice the elbow's 0 and 0.1
+    assert [len(model.geometry(k).geometryObjects) for k in (pin.VISUAL, pin.COLLISION)] == [1, 1]
+
+
+def chain(links: int, moving: int) -> str:
+    kinds = ["revolute"] * moving + ["fixed"] * (links - 1 - moving)
+    parts = [f'<link name="l{i}">{INERTIAL}</link>' for i in range(links)] + [
+        f'<joint name="j{i}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>'
+        f'<origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>{LIMIT}</joint>'
+        for i, kind in enumerate(kinds)
+    ]
+    return f'<robot name="chain">{"".join(parts)}</robot>'
+
+
+DEEP = "<x>" * 200_000 + "</x>" * 200_000
+NODES = '<COLLADA><library_visual_scenes><visual_scene id="s">' + '<node id="n">' * 100_000
+CRASHERS = {
+    "20,000 links": (chain(20_000, 3), "20000 links; at most 1000 are read"),
+    "1,000 moving joints": (chain(1000, 999), "999 joints move, at most 8 can; write a robot spec with this `urdf` "),
+    "1,000 links, most of them fixed": (chain(1000, 3), None),
+    "deep nesting": (ARM.replace("</robot>", DEEP + "</robot>"), None),
+    "deep nesting in a link": (ARM.replace("</link>", DEEP + "</link>", 1), None),
+    "zeros": ("\0" * 1000, "not valid XML ("),
+    "garbage": (bytes(range(128)).decode() * 100, "not valid XML ("),
+    "a joint that is its own mimic": (ARM.replace('joint="elbow"', 'joint="slider"'), None),
+    "nested Collada nodes": (ARM.replace("fore.stl", "nodes.dae"), None),
+    "a device for a mesh": (ARM.replace("fore.stl", "/dev/zero"), None),
+    "a pipe for a mesh": (ARM.replace("fore.stl", "pipe.stl"), None),
+    "a huge mesh": (ARM.replace("fore.stl", "huge.stl"), None),
+    "a mesh of noise": (ARM.replace("fore.stl", "noise.dae"), None),
+    "a mesh that is a folder": (ARM.replace("fore.stl", "folder.stl"), None),
+}
+RUN = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+from test_urdf_fuzz import model_or_refusal
+for path in sys.argv[2:]:
+    found = model_or_refusal(Path(path))
+    print(found if isinstance(found, str) else "model; " + "; ".join(found.warnings), flush=True)
+"""
+
+
+def test_what_might_crash_the_interpreter(tmp_path):
+    for name, content in (("nodes.dae", NODES), ("noise.dae", "<COLLADA>\x01\x02"), ("fore.stl", TETRAHEDRON)):
+        (tmp_path / name).write_text(content)
+    os.mkfifo(tmp_path / "pipe.stl")
+    (tmp_path / "folder.stl").mkdir()
+    with (tmp_path / "huge.stl").open("wb") as file:
+        file.truncate(10 * MAX_BYTES)  # sparse
+    paths = [tmp_path / f"arm{i}.urdf" for i in range(len(CRASHERS))]
+    for path, (text, _) in zip(paths, CRASHERS.values(), strict=True):
+        path.write_text(text, encoding="utf-8")
+    before = sorted(tmp_path.iterdir())
+    command = [sys.executable, "-c", RUN, str(Path(__file__).parent), *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    said = dict(zip(CRASHERS, done.stdout.splitlines(), strict=False))
+    assert done.returncode == 0, (list(said)[-1:], done.stderr[-500:])
+    for (name, (_, refusal)), path in zip(CRASHERS.items(), paths, strict=True):
+        assert said[name].startswith("model; " if refusal is None else f"{path}: {refusal}"), said[name]
+    assert "'nodes.dae' has 100000 nodes, more than 1000; merge them" in said["nested Collada nodes"]
+    assert "'huge.stl' is larger than 50 MB; simplify it" in said["a huge mesh"]
+    assert "'noise.dae' cannot be read" in said["a mesh of noise"]
+    for name in ("a pipe for a mesh", "a mesh that is a folder", "a device for a mesh"):
+        assert "is not there" in said[name]
+    assert sorted(tmp_path.iterdir()) == before
+
+
+# ------------------------------------------------------------------------------------- wild, but usable
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(text, encoding="utf-8")
+    (folder / "fore.stl").write_text(TETRAHEDRON)
+    return path
+
+
+def test_joints_without_limits_take_the_specs(tmp_path):
+    path = written(tmp_path, ARM.replace(LIMIT, "", 1))
+    text = model_or_refusal(path)
+    assert text == (
+        f"{path}: joint 'elbow' has no usable effort and velocity limit (got 0); give them in a robot spec, "
+        "e.g. `effort: {elbow: 10.0}` and `velocity: {elbow: 2.0}`, or lock the joint"
+    )
+    model = RobotModel(path, effort={"elbow": 7.0}, velocity={"elbow": 1.5})
+    np.testing.assert_array_equal(model.u_max, [20.0, 7.0])
+    np.testing.assert_array_equal(model.q_upper, [np.inf, np.inf])
+    np.testing.assert_allclose(derive_domain(model, DomainSpec()).q[1], [-np.pi, np.pi])
+    assert "joint 'elbow' has no position limits: taken to turn freely, half a turn either way in X" in model.warnings
+    bounded = RobotModel(path, effort=7.0, velocity=1.5, position={"elbow": (-1.0, 2.0)})
+    assert (bounded.q_lower[1], bounded.q_upper[1]) == (-1.0, 2.0)
+    whole = RobotModel(written(tmp_path, ARM))
+    q, v = whole.from_angles(np.array([0.3, 0.4])), np.array([0.5, -0.6])
+    np.testing.assert_array_equal(model.evaluate(q, v).M, whole.evaluate(q, v).M)
+
+
+def test_position_limits_that_do_not_fit(tmp_path):
+    path = written(tmp_path, ARM.replace('<mimic joint="elbow" multiplier="2" offset="0.1"/>', ""))
+    bare = written(tmp_path, path.read_text().replace('xyz="1 0 0"/>' + LIMIT, 'xyz="1 0 0"/>'))
+    for overrides, expected in (
+        ({}, "joint 'slider' has no position range; give one in a robot spec, e.g. `position: {slider: [0.0, 0.5]}`, "
+         "or lock the joint"),
+        ({"position": {"pan": (0.0, 1.0)}}, "position: joint 'pan' is continuous and has no limits; remove them"),
+        ({"position": {"wrist": (0.0, 1.0)}},
+         "position: no moving joint is named 'wrist' (moving joints: pan, elbow, slider)"),
+    ):  # fmt: skip
+        assert model_or_refusal(bare, effort=9.0, velocity=1.0, **overrides) == f"{bare}: {expected}"
+    assert isinstance(
+        model_or_refusal(bare, effort=9.0, velocity=1.0, position={"slider": (0.0, 0.3)}), RobotModel
+    )  # fmt: skip
+
+
+def test_one_sided_limits_leave_a_domain_of_one_turn(tmp_path):
+    model = RobotModel(written(tmp_path, ARM.replace('lower="-2" upper="2"', 'lower="4" upper="1e308"', 1)))
+    np.testing.assert_allclose(derive_domain(model, DomainSpec()).q[1], [4.0, 4.0 + 2.0 * np.pi])
+
+
+def test_mimics_stand_where_their_locked_joint_puts_them(tmp_path):
+    model = RobotModel(written(tmp_path, ARM), locked={"elbow": 0.3})
+    assert model.locked == {"elbow": 0.3, "slider": pytest.approx(0.7)}
+    assert RobotModel(model.urdf, moving=["pan", "slider"]).joint_names == ["pan", "slider"]  # by the user's will
+
+
+def test_axes_of_any_length_turn_alike(tmp_path):
+    q, v = np.array([1.0, 0.0, 0.7]), np.array([0.3, -0.2])
+    unit, long = (RobotModel(written(tmp_path, ARM.replace("0 1 0", axis))) for axis in ("0 0.6 0.8", "0 6 8"))
+    for a, b in zip(vars(unit.evaluate(q, v)).values(), vars(long.evaluate(q, v)).values(), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_a_small_fixed_link_with_odd_products_of_inertia_passes_but_not_a_moving_one(tmp_path):
+    tiny = INERTIA.replace("0.002", "1e-7").replace("0.0001", "2e-7").replace('izz="0.001"', 'izz="1e-7"')
+    hand = f'<link name="hand"><inertial><mass value="0.1"/>{INERTIA}'
+    assert isinstance(model_or_refusal(written(tmp_path, ARM.replace(hand, hand.replace(INERTIA, tiny)))), RobotModel)
+    text = model_or_refusal(written(tmp_path, ARM.replace('ixz="0.0001"', 'ixz="0.1"', 1)))
+    assert "the link moved by joint 'pan' has an inertia with the negative eigenvalue -0.0985" in str(text)
+
+
+@pytest.mark.parametrize("name", ["package://arm/fore.stl", "package://other/fore.stl", "fore.stl", "./fore.stl",
+                                  "sub/../fore.stl", "{folder}/fore.stl", "file://{folder}/fore.stl"])  # fmt: skip
+def test_meshes_are_found(tmp_path, name):
+    folder = tmp_path / "arm"
+    (folder / "sub").mkdir(parents=True)
+    path = written(folder, ARM.replace("fore.stl", name.format(folder=folder)))
+    model = RobotModel(path, default_package_dirs(path))
+    assert [len(o.geometry.vertices()) for o in model.geometry(pin.GeometryType.VISUAL).geometryObjects] == [4]
+    assert model.warnings == ["joint 'slider' mimics another joint and was locked at 0.1"]
+
+
+def test_missing_meshes_leave_the_dynamics_and_the_other_links(tmp_path):
+    mesh = '<collision><geometry><mesh filename="package://nowhere/a.stl"/></geometry></collision>'
+    upper = f'<link name="upper">{INERTIAL}{CYLINDER}'
+    path = written(tmp_path, ARM.replace(upper, upper + mesh))
+    robot = load_robot(str(path))
+    assert (
+        "link 'upper' lacks collision geometry: the mesh 'package://nowhere/a.stl' is not there"
+        in robot.model.warnings
+    )  # fmt: skip
+    assert not robot.model.geometry(pin.GeometryType.COLLISION).geometryObjects  # half of a link is not the link
+    assert len(robot.model.geometry(pin.GeometryType.VISUAL).geometryObjects) == 1
+    assert {s.frame for s in robot.body} <= {"upper", "fore", "hand"}
+    assert robot.body
+
+
+def test_triangles_are_counted_before_loading(tmp_path):
+    binary = bytes(80) + (3).to_bytes(4, "little") + bytes(150)
+    polylist = b"<mesh><triangles material='a' count=\"7\"></triangles><polylist count='5'/></mesh>"
+    for suffix, content, count in ((".stl", TETRAHEDRON.encode(), 4), (".stl", binary, 3),
+                                   (".obj", b"v 0 0 0\nf 1 2 3\nf 1 2 3\n", 2), (".dae", polylist, 12),
+                                   (".ply", b"ply\nelement vertex 9\nelement face 4\n", 9)):  # fmt: skip
+        assert count_triangles(suffix, content) == count
+    many = tmp_path / "many.ply"
+    many.write_bytes(b"ply\nelement vertex 999999999999\n")
+    assert mesh_problem(many) == f"has 999999999999 triangles, more than {MAX_TRIANGLES}; simplify it"
+    assert "unknown format" in mesh_problem(tmp_path / "a.blend")
+    assert find_mesh("a" * 5000, tmp_path / "arm.urdf", []) is None
