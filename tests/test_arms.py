@@ -19,14 +19,9 @@ from ppcbf_robots.specs import Array
 ARMS = {"panda": (7, 7), "panda_collision": (7, 7), "ur3": (6, 6), "ur5": (6, 6), "ur10": (6, 6), "kinova": (9, 6),
         "z1": (6, 6), "xarm7": (7, 7), "talos_left_arm": (6, 6), "so100": (5, 5), "so101": (5, 5),
         "double_pendulum": (2, 2), "asr_twodof": (2, 2), "tiago_no_hand": (7, 7), "baxter": (7, 7),
-        "tiago_arm": (7, 7), "baxter_left": (7, 7), "baxter_right": (7, 7)}  # fmt: skip
+        "baxter_right": (7, 7)}  # fmt: skip
 """(nq, nv) without grippers; kinova has three continuous joints."""
-HEAVY = {
-    "talos_left_arm": "arm_left_2_joint",
-    "baxter": "left_s1",
-    "baxter_left": "left_s1",
-    "baxter_right": "right_s1",
-}
+HEAVY = {"talos_left_arm": "arm_left_2_joint", "baxter": "left_s1", "baxter_right": "right_s1"}
 """Joints whose URDF effort is below gravity in some postures: no controller can hold those."""
 MOST_OUTSIDE = 1e-3  # share of X
 
