@@ -74,14 +74,13 @@ def clean_joint(path: Path, joint: Element) -> tuple[Element, JointFacts | None]
 
 
 def _axis(path: Path, joint: Element, name: str) -> list[float]:
-    """Unit axis: Pinocchio takes the length as it comes and would scale the joint with it."""
+    """Axis of any length but zero; Pinocchio makes it a unit vector."""
     axis = joint.find("axis")
     text = "1 0 0" if axis is None else axis.get("xyz") or "1 0 0"
     values = [number(path, x, f"joint '{name}', axis") for x in text.split()]
-    length = math.hypot(*values)
-    if len(values) != 3 or length < 1e-6:
+    if len(values) != 3 or math.hypot(*values) < 1e-6:
         raise InputError(f"{path}: joint '{name}': the axis must be a vector of three numbers, not all zero")
-    return values if length == 1.0 else [x / length for x in values]
+    return values
 
 
 def _force_limit(path: Path, joint: Element, name: str, what: str) -> float:
