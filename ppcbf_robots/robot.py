@@ -269,10 +269,7 @@ class RobotModel:
         return self.from_angles(vector(values, self.nv, what))
 
     def geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
-        """Visual or collision geometry of the reduced model; ValueError if Pinocchio cannot build it.
-
-        Shapes whose mesh cannot be read are left out with a warning.
-        """
+        """Visual or collision geometry of the reduced model; shapes without a readable mesh are left out."""
         what = "collision" if kind == pin.GeometryType.COLLISION else "visual"
         shapes, wrong = self._meshes.geometry(kind, self.full_model, self.locked)
         if wrong:

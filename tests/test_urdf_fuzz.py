@@ -301,7 +301,8 @@ def test_axes_of_any_length_turn_alike(tmp_path):
     ("old", "new", "expected"),
     [
         ("0.4 0 0", "400 0 0", "joint 'elbow', origin xyz: 400 is more than 100, which no arm has; check the units"),
-        ('value="0.5"', 'value="1e9"', "link 'upper', mass: 1e+09 is more than 1e+06, which no arm has; check the units"),
+        ('value="0.5"', 'value="1e9"',
+         "link 'upper', mass: 1e+09 is more than 1e+06, which no arm has; check the units"),
         ('name="elbow"', 'name=" "', "a <joint> has no name; give it one"),
         ('link name="hand"', 'link name="fore"', "2 links are named 'fore'; give each its own name"),
         ('type="continuous"', 'type="screw"',
