@@ -36,16 +36,15 @@ class Domain:
 
 def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
     """Given bounds, else the URDF's position limits (half a turn where there are none) and ± the velocity limits."""
-    lower = np.where(np.isfinite(robot.q_lower), robot.q_lower, -WIDE_TURN)
-    upper = np.where(np.isfinite(robot.q_upper), robot.q_upper, WIDE_TURN)
+    low, high = robot.q_lower, robot.q_upper
+    lower = np.where(np.isfinite(low), low, np.minimum(-WIDE_TURN, high - 2.0 * WIDE_TURN))
+    upper = np.where(np.isfinite(high), high, np.maximum(WIDE_TURN, low + 2.0 * WIDE_TURN))
     q, v = np.stack([lower, upper], 1), np.stack([-robot.v_max, robot.v_max], 1)
     for name, given in (("q", spec.q), ("v", spec.v)):
         if given is not None and len(given) != robot.nv:
             raise InputError(f"domain.{name}: expected {robot.nv} pairs, one per moving joint, got {len(given)}")
     q = q if spec.q is None else np.asarray(spec.q, float)
     v = v if spec.v is None else np.asarray(spec.v, float)
-    for i in np.flatnonzero(~(q[:, 0] < q[:, 1])):
-        raise InputError(f"joint '{robot.joint_names[i]}' has no position range; lock it, or give domain.q")
     return Domain(q, v)
 
 
@@ -64,6 +63,11 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
         inertia += np.diag(dyn.M) / SAMPLES
         g_max = np.maximum(g_max, np.abs(dyn.g))
         Minvs.append(dyn.Minv)
+    for i in np.flatnonzero(g_max > robot.u_max):
+        robot.warnings.append(
+            f"gravity alone takes up to {g_max[i]:.3g} of joint '{robot.joint_names[i]}', whose effort limit is "
+            f"{robot.u_max[i]:.3g}: such postures cannot be held; narrow domain.q"
+        )
     fastest = np.abs(domain.v).max(axis=1)
     room = np.maximum(robot.u_max - g_max, 0.05 * robot.u_max)
     kd = _stable_damping(DAMPING_SHARE * room / fastest, Minvs)

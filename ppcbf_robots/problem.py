@@ -97,6 +97,7 @@ class Problem:
             "locked": m.locked,
             "u_max": m.u_max.tolist(),
             "v_max": m.v_max.tolist(),
+            **({"position": self.robot.spec.position} if self.robot.spec.position else {}),
             "payload": None if self.robot.spec.payload is None else self.robot.spec.payload.model_dump(),
             "body": [s.model_dump() for s in self.robot.body],
         }
@@ -131,7 +132,8 @@ def load_robot(name: str) -> Robot:
     else:
         spec, urdf = RobotSpec(urdf=str(path)), path
     dirs = [(path.parent / d).resolve() for d in spec.package_dirs] + default_package_dirs(urdf)
-    model = RobotModel(urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload)
+    model = RobotModel(urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload, spec.moving, spec.position)
+    model.warnings += [spec.note] if spec.note else []
     domain = derive_domain(model, spec.domain)
     model.check_mass_matrix(domain.sample_q(np.random.default_rng(SAMPLE_SEED), 100))
     derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]

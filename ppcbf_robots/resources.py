@@ -10,6 +10,8 @@ from ppcbf_robots.errors import InputError
 
 YAML_SUFFIXES = (".yaml", ".yml")
 WORLD_SUFFIXES = (".scene", ".urdf", ".xml")  # of worlds that are not YAML
+ALIASES = {"baxter": "baxter_left", "tiago_no_hand": "tiago_arm"}
+"""Robots of example-robot-data that have more than an arm, and the bundled spec of one arm that their name gives."""
 
 
 def bundled(folder: str, suffix: str = ".yaml") -> dict[str, Path]:
@@ -30,6 +32,7 @@ def find_robot(name: str) -> Path:
             return path
         raise InputError(f"robot file not found: {path}")
     specs = bundled("robots")
+    name = ALIASES.get(name, name)
     if name in specs:
         return specs[name]
     example = find_example(name)
@@ -44,7 +47,7 @@ def find_robot(name: str) -> Path:
 def find_example(name: str) -> Path | None:
     """The URDF of a robot in example-robot-data, by file name (``ur5`` finds ``ur5_robot.urdf``), or None."""
     example = _example_urdfs()
-    return example.get(name) or example.get(f"{name}_robot")
+    return example.get(f"{name}_robot") or example.get(name)  # in this order: its ur3.urdf is empty
 
 
 def find_world(name: str) -> Path:

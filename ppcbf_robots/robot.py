@@ -16,8 +16,10 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits
 from ppcbf_robots.kernels import points_at
-from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, per_joint, vector
+from ppcbf_robots.meshes import Meshes
+from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, vector
 from ppcbf_robots.urdf import check_urdf
 
 PD_RELATIVE_FLOOR = 1e-10  # least over largest eigenvalue of M below which M counts as singular
@@ -93,8 +95,10 @@ class RobotModel:
         urdf: path of the URDF.
         package_dirs: folders against which ``package://`` is resolved (meshes only; the dynamics need none).
         locked: joints held at a position, by name [rad | m].
+        moving: joints that are not held, by name or pattern; None means all but mimics and grippers.
         effort: torque limits, overriding the URDF's [N m | N].
         velocity: velocity limits, overriding the URDF's [rad/s | m/s].
+        position: position limits by joint, overriding the URDF's [rad | m].
         payload: a point mass added to a frame.
 
     Raises:
@@ -109,25 +113,25 @@ class RobotModel:
         effort: PerJoint | None = None,
         velocity: PerJoint | None = None,
         payload: PayloadSpec | None = None,
+        moving: Sequence[str] | None = None,
+        position: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         self.urdf = Path(urdf)
         self.package_dirs = [Path(p) for p in package_dirs]
-        self.warnings: list[str] = []
         facts = check_urdf(self.urdf)
+        self.warnings = list(facts.warnings)
         self.name = facts.name
         self.urdf_sha256 = hashlib.sha256(self.urdf.read_bytes()).hexdigest()
         try:
-            self.full_model = pin.buildModelFromUrdf(str(self.urdf))
+            self.full_model = pin.buildModelFromXML(facts.xml)
         except (ValueError, RuntimeError) as error:
             raise InputError(f"{self.urdf}: Pinocchio cannot read it ({' '.join(str(error).split())})") from None
-        self.locked = self._locked(dict(locked or {}), facts.mimic_joints)
-        self.reference = self._reference()
-        ids = [self.full_model.getJointId(n) for n in self.locked]
-        self.model = pin.buildReducedModel(self.full_model, ids, self.reference) if ids else self.full_model
-        if self.model.nv == 0:
-            raise InputError(f"{self.urdf}: no joint moves; check 'locked' and the joint types")
+        if self.full_model.nv == 0:
+            raise InputError(f"{self.urdf}: no joint moves; check the joint types")
+        self._meshes = Meshes(self.urdf, self.package_dirs, facts.root)
+        self.locked = locked_joints(self.urdf, self.full_model, facts.joints, locked or {}, moving, self.warnings)
+        self.model = lock(self.full_model, self.locked)[0]
         self.joint_names = list(self.model.names)[1:]
-        self._check_joint_types()
         if payload is not None:
             self._add_payload(payload)
         self.data = self.model.createData()
@@ -135,36 +139,9 @@ class RobotModel:
         self._oMi = _strided(self.data.oMi)
         self._below = np.tril_indices(self.nv, -1)
         self._index_joints()
-        self.u_max = self._limits("effort", self.model.upperEffortLimit, effort)
-        self.v_max = self._limits("velocity", self.model.upperVelocityLimit, velocity)
-
-    def _locked(self, locked: dict[str, float], mimics: Sequence[str]) -> dict[str, float]:
-        names = list(self.full_model.names)[1:]
-        for joint in locked:
-            if joint not in names:
-                raise InputError(
-                    f"{self.urdf}: locked joint '{joint}' is not a moving joint (moving: {', '.join(names)})"
-                )
-        for joint in mimics:
-            if joint in names and joint not in locked:
-                locked[joint] = 0.0
-                self.warnings.append(f"joint '{joint}' mimics another joint and was locked at 0")
-        return locked
-
-    def _reference(self) -> Array:
-        q = pin.neutral(self.full_model)
-        for joint, position in self.locked.items():
-            j = self.full_model.joints[self.full_model.getJointId(joint)]
-            q[j.idx_q : j.idx_q + j.nq] = [np.cos(position), np.sin(position)] if j.nq == 2 else [position] * j.nq
-        return np.asarray(q)
-
-    def _check_joint_types(self) -> None:
-        for name, joint in zip(self.joint_names, list(self.model.joints)[1:], strict=True):
-            if joint.nv != 1 or joint.nq > 2:
-                raise InputError(
-                    f"{self.urdf}: joint '{name}' has {joint.nv} degrees of freedom; only revolute, prismatic and "
-                    "continuous joints are supported (lock it, or split it)"
-                )
+        names = self.joint_names
+        self.u_max, self.v_max = force_limits(self.urdf, names, facts.joints, effort, velocity)
+        self.q_lower, self.q_upper = position_limits(self.urdf, names, facts.joints, position or {}, self.warnings)
 
     def _add_payload(self, payload: PayloadSpec) -> None:
         frame = self.model.frames[self.frame_id(payload.frame)]
@@ -187,28 +164,10 @@ class RobotModel:
                 self.rate_const[[c, s]] = 0.0
                 self.rate_partner[[c, s]] = s, c
                 self.rate_sign[[c, s]] = -1.0, 1.0
-        lower, upper = np.asarray(self.model.lowerPositionLimit), np.asarray(self.model.upperPositionLimit)
-        self.q_lower = np.where(self.continuous, -np.inf, lower[self.idx_q])
-        self.q_upper = np.where(self.continuous, np.inf, upper[self.idx_q])
         self.ancestors = np.zeros((self.model.njoints, self.nv))
         for joint in range(1, self.model.njoints):
             for support in list(self.model.supports[joint])[1:]:
                 self.ancestors[joint, self.model.joints[support].idx_v] = 1.0
-
-    def _limits(self, what: str, from_urdf: Array, override: PerJoint | None) -> Array:
-        limits = np.asarray(from_urdf, float).copy()
-        usable = np.isfinite(limits) & (limits > 0.0)
-        if override is not None:
-            limits = per_joint(override, self.joint_names, what, default=limits)
-            usable = np.isfinite(limits) & (limits > 0.0)
-        for i in np.flatnonzero(~usable):
-            name = self.joint_names[i]
-            unit = "10.0" if what == "effort" else "2.0"
-            raise InputError(
-                f"{self.urdf}: joint '{name}' has no usable {what} limit (got {limits[i]:g}); "
-                f"give one in a robot spec, e.g. `{what}: {{{name}: {unit}}}`, or lock the joint"
-            )
-        return limits
 
     def frame_id(self, name: str) -> int:
         """Pinocchio's id of a link or frame; InputError if there is none by that name."""
@@ -315,16 +274,19 @@ class RobotModel:
         return self.from_angles(vector(values, self.nv, what))
 
     def geometry(self, kind: pin.GeometryType) -> pin.GeometryModel:
-        """Visual or collision geometry of the reduced model; ValueError if meshes are missing."""
-        dirs = [str(d) for d in self.package_dirs]
-        full = pin.buildGeomFromUrdf(self.full_model, str(self.urdf), kind, package_dirs=dirs)
-        if not self.locked:
-            return full
-        ids = [self.full_model.getJointId(n) for n in self.locked]
-        return pin.buildReducedModel(self.full_model, [full], ids, self.reference)[1][0]
+        """Visual or collision geometry of the reduced model; shapes without a readable mesh are left out."""
+        what = "collision" if kind == pin.GeometryType.COLLISION else "visual"
+        shapes, wrong = self._meshes.geometry(kind, self.full_model, self.locked)
+        if wrong:
+            link, problem = next(iter(wrong.items()))
+            more = f", and {len(wrong) - 1} more links have such a mesh" if len(wrong) > 1 else ""
+            warning = f"link '{link}' lacks {what} geometry: the mesh {problem}{more}"
+            self.warnings += [] if warning in self.warnings else [warning]
+        return shapes
 
     def check_mass_matrix(self, angles: Array) -> None:
         """Refuse a mass matrix that is not positive definite at any of ``angles`` (B, nv)."""
+        check_inertias(self.urdf, self.model)
         for q in self.from_angles(angles):
             M = np.triu(pin.crba(self.model, self.data, q))
             M = M + np.triu(M, 1).T

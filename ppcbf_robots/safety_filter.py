@@ -100,8 +100,8 @@ class SafetyFilter:
         rows = self.barrier.rows(dyn, self.safety.evaluate(dyn))
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
-        wanted = (u_des @ u_des if u_des.shape == (self.robot.nv,) else np.nan) + (d_p or 0.0)
-        if not math.isfinite(wanted + rows.Lf_phi @ rows.Lf_phi + np.vdot(rows.Lg_phi, rows.Lg_phi)):
+        wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
+        if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
             u = self._fallback(dyn) - offset
             return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")
         c = self.correction.correct(dyn, rows, u_des + offset, d_p, self.robot.u_max)
@@ -128,7 +128,7 @@ class SafetyFilter:
             return f"state of shape {q.shape}, {v.shape} instead of ({self.robot.nq},), ({self.robot.nv},)"
         if not isinstance(t, int | float | np.number) or not np.isfinite(t):
             return "time not a finite number"
-        if not math.isfinite(q @ q + v @ v):
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
             return "state not finite"
         c = self.robot.idx_q[self.robot.continuous]
         if len(c) and np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):

@@ -104,9 +104,11 @@ class RobotSpec(Spec):
 
     urdf: str
     package_dirs: list[str] = []
+    moving: Annotated[list[str], Field(min_length=1)] | None = None  # all other joints are locked
     locked: dict[str, float] = {}
     effort: PerJoint | None = None
     velocity: PerJoint | None = None
+    position: dict[str, tuple[float, float]] = {}
     controller: ControllerSpec | None = None
     body: list[BodyPrimitive] | None = None
     domain: DomainSpec = DomainSpec()
@@ -115,6 +117,14 @@ class RobotSpec(Spec):
     goal: list[float] | None = None
     payload: PayloadSpec | None = None
     barrier: BarrierSpec = BarrierSpec()
+    note: str | None = None  # shown with the warnings, e.g. which data are assumed
+
+    @model_validator(mode="after")
+    def _ordered(self) -> RobotSpec:
+        for joint, (low, high) in self.position.items():
+            if not low < high:
+                raise ValueError(f"position.{joint}: the lower limit {low} must be below the upper limit {high}")
+        return self
 
 
 class _Loader(yaml.SafeLoader):

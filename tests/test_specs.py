@@ -104,15 +104,18 @@ URDF_MISTAKES = {
     "negative inertia": ('iyy="0.01"', 'iyy="-2"',
                          "link 'upper': the moment of inertia iyy is -2.0; it must not be negative"),
     "no effort limit": (' effort="20"', "",
-                        "joint 'shoulder': its <limit> has no effort; write one, such as effort=\"10\""),
+                        "joint 'shoulder' has no usable effort limit (got 0); "
+                        "give one in a robot spec, e.g. `effort: {shoulder: 10.0}`, or lock the joint"),
     "zero effort limit": ('effort="20"', 'effort="0"', "joint 'shoulder' has no usable effort limit (got 0); "
                           "give one in a robot spec, e.g. `effort: {shoulder: 10.0}`, or lock the joint"),
     "no limit": ('<limit lower="-2" upper="2" effort="20" velocity="3"/>', "",
-                 "joint 'shoulder' has no <limit>; give it one with lower, upper, effort and velocity"),
+                 "joint 'shoulder' has no usable effort and velocity limit (got 0); give them in a robot spec, "
+                 "e.g. `effort: {shoulder: 10.0}` and `velocity: {shoulder: 2.0}`, or lock the joint"),
     "zero velocity limit": ('velocity="3"', 'velocity="0"', "joint 'shoulder' has no usable velocity limit (got 0); "
                             "give one in a robot spec, e.g. `velocity: {shoulder: 2.0}`, or lock the joint"),
     "infinite velocity": ('velocity="3"', 'velocity="inf"',
-                          "joint 'shoulder', limit velocity: inf is not a finite number"),
+                          "joint 'shoulder' has no usable velocity limit (got 0); "
+                          "give one in a robot spec, e.g. `velocity: {shoulder: 2.0}`, or lock the joint"),
     "swapped limits": ('lower="-2" upper="2"', 'lower="2" upper="-2"',
                        "joint 'shoulder': lower limit 2.0 is above upper limit -2.0; swap them"),
     "DOCTYPE": ("<robot", '<!DOCTYPE robot [<!ENTITY a "b">]><robot',
@@ -179,7 +182,7 @@ NUMBERS = [(m.start(), m.end()) for m in re.finditer(r'(?<=[ "])-?[0-9.]+(?=[ "]
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
 @pytest.mark.parametrize("where", NUMBERS, ids=lambda span: ARM[: span[0]].rsplit("<", 1)[1] + str(span[0]))
 def test_no_number_of_a_urdf_may_be_infinite_or_nan(files, where, value):
-    """But for position limits, where infinity means none."""
+    """But for limits, where infinity means none."""
     text = ARM[: where[0]] + value + ARM[where[1] :]
     key = ARM[: where[0]].rsplit(" ", 1)[1]
     if key.startswith(("lower", "upper")) and value != "nan":
@@ -257,8 +260,8 @@ def test_mistakes_in_a_robot_spec(files, mistake):
         ("{shoulder: 30.0}", "{wrist: 30.0}",
          "effort: no moving joint is named 'wrist' (moving joints: shoulder, elbow)"),
         ("{shoulder: 30.0}", "[1.0, 2.0, 3.0]", "effort: expected 2 numbers, one per moving joint, got 3"),
-        ("{shoulder: 30.0}", "-5.0", "{urdf}: joint 'shoulder' has no usable effort limit (got -5); give one in a "
-         "robot spec, e.g. `effort: {{shoulder: 10.0}}`, or lock the joint"),
+        ("{shoulder: 30.0}", "-5.0", "{urdf}: joints 'shoulder', 'elbow' have no usable effort limit (got -5); give "
+         "them in a robot spec, e.g. `effort: {{shoulder: 10.0, elbow: 10.0}}`, or lock the joint"),
         ("kp: 5.0", "kp: -5.0", "controller.kp: must not be negative, got [-5.0, -5.0]"),
         ("effort:", "locked: {wrist: 0.0}\neffort:",
          "{urdf}: locked joint 'wrist' is not a moving joint (moving: shoulder, elbow)"),
@@ -346,7 +349,8 @@ def test_missing_files_and_unknown_names(tmp_path):
     assert message(load_robot, "nope.yaml") == "robot file not found: nope.yaml"
     assert message(load_robot, "nope.urdf") == "robot file not found: nope.urdf"
     assert message(load_robot, "nope") == (
-        "no robot named 'nope': give a URDF or YAML path, a bundled name (cartpole, panda, two_link), "
+        "no robot named 'nope': give a URDF or YAML path, a bundled name (asr_twodof, baxter_left, baxter_right, "
+        "cartpole, double_pendulum, panda, tiago_arm, two_link, ur3), "
         "or the name of a URDF in example-robot-data, such as ur5, z1 or xarm7"
     )
     assert message(find_world, "nope.yaml") == "obstacle file not found: nope.yaml"
