@@ -32,7 +32,9 @@ def simulate(
     metric: Annotated[
         Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")
     ] = None,
-    solver: Annotated[str, typer.Option(help="proxqp, or a solver installed for qpsolvers.")] = "proxqp",
+    solver: Annotated[
+        str, typer.Option(help="daqp, proxqp, or a solver installed for qpsolvers.")
+    ] = FilterConfig.solver,
     start: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
     velocity: Annotated[str | None, typer.Option(metavar="V,...", help="Start velocity.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
@@ -88,7 +90,7 @@ def choose_barrier(
     name: str,
     kind: FilterKind | None,
     metric: Metric | None,
-    solver: str = "proxqp",
+    solver: str = FilterConfig.solver,
     dt: float = 1e-3,
 ) -> tuple[Barrier | None, FilterConfig]:
     """A barrier by name or folder, and the filter settings that go with it unless others are asked for."""

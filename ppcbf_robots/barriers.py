@@ -18,6 +18,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from ppcbf_robots.condense import rho_rows_at
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyRows
@@ -75,24 +76,21 @@ class RhoBarrier:
 
     def rows(self, dyn: Dynamics, safety: SafetyRows) -> BarrierRows:
         """Eq. (10), (11), (25) of the paper."""
+        gamma = self.spec.gamma
         if self.network is None:
-            K = K_q_rate = np.zeros(dyn.v.shape[:-1])
-            K_v = np.zeros_like(dyn.v)
+            K, K_v = np.zeros(dyn.v.shape[:-1]), np.zeros_like(dyn.v)
+            K_q_rate = K
         else:
             K, K_q, K_v = self.network.value_and_grad(dyn.q, dyn.v)
             K_q_rate = (K_q * self.robot.q_rate(dyn.q, dyn.v)).sum(-1)
-        return rho_rows(
-            safety.h,
-            safety.hdot(dyn.v),
-            safety.grad,
-            safety.curvature,
-            dyn.Minv,
-            dyn.b,
-            self.spec.gamma,
-            K,
-            K_q_rate,
-            K_v,
-        )
+        if dyn.v.ndim > 1:
+            hdot = safety.hdot(dyn.v)
+            return rho_rows(safety.h, hdot, safety.grad, safety.curvature, dyn.Minv, dyn.b, gamma, K, K_q_rate, K_v)
+        found = rho_rows_at(
+            safety.h, safety.grad, safety.drift, safety.curvature, dyn.v, dyn.Minv, dyn.b, gamma, float(K),
+            float(K_q_rate), K_v,
+        )  # fmt: skip
+        return BarrierRows(safety.h, *found)
 
 
 class EnergyBarrier:

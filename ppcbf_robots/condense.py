@@ -1,4 +1,4 @@
-"""Rows of the runtime QP, compiled: from phi and its derivatives to rows of length 1 in the scaled correction."""
+"""Rows of the barrier and of the runtime QP at one state, compiled."""
 
 from __future__ import annotations
 
@@ -122,3 +122,27 @@ def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
                 H[i, j] = (Minv[i, j] if kinetic else 1.0) * u_max[i] * u_max[j]
         trace += H[i, i]
     return H * (n / trace)
+
+
+@kernel
+def rho_rows_at(
+    h: Any, grad: Any, drift: Any, curvature: Any, v: Any, Minv: Any, b: Any, gamma: float, K: float, K_q_rate: float,
+    K_v: Any,
+) -> tuple[Any, Any, Any, Any]:  # fmt: skip
+    """phi (R,), L_f phi (R,), L_g phi and w (R, nv) of :func:`ppcbf_robots.barriers.rho_rows` at one state."""
+    R, nv = grad.shape
+    phi, Lf, Lg, w = np.empty(R), np.empty(R), np.empty((R, nv)), np.empty((R, nv))
+    for k in range(R):
+        hdot, bias = drift[k], 0.0
+        for j in range(nv):
+            hdot += grad[k, j] * v[j]
+            w[k, j] = grad[k, j] - K_v[j]
+            Lg[k, j] = 0.0
+        for i in range(nv):
+            for j in range(nv):
+                Lg[k, j] += w[k, i] * Minv[i, j]
+        for j in range(nv):
+            bias += Lg[k, j] * b[j]
+        phi[k] = hdot + gamma * h[k] - K
+        Lf[k] = curvature[k] + gamma * hdot - K_q_rate - bias
+    return phi, Lf, Lg, w

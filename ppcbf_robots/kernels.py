@@ -180,6 +180,14 @@ def point_kinematics(
 
 
 @kernel
+def mirror(A: Any) -> None:
+    """Copy the upper triangle of a square matrix to the lower one."""
+    for i in range(len(A)):
+        for j in range(i):
+            A[i, j] = A[j, i]
+
+
+@kernel
 def points_at(placements: Any, J: Any, dJ: Any, v: Any, joints: Any, offsets: Any, mask: Any, p: Any, Jp: Any,
               acc: Any) -> None:  # fmt: skip
     """:func:`point_kinematics` for a batch: every state's array carries a leading axis."""
@@ -190,32 +198,39 @@ def points_at(placements: Any, J: Any, dJ: Any, v: Any, joints: Any, offsets: An
 
 @kernel
 def _obstacle_row(
-    p: Vector, vel: Vector, acc: Vector, kind: int, size: Any, planes: Any, first: int, end: int, f: Any, motion: Any
-) -> tuple[float, float, float, float, float, float]:
+    p: Vector, vel: Vector, acc: Vector, kind: int, size: Any, planes: Any, first: int, end: int, f: Any,
+    motion: Any, moves: bool,
+) -> tuple[float, float, float, float, float, float]:  # fmt: skip
     """h, ∂h/∂t, ḧ without ``∇h a``, and ∇h in the base frame, of one body point and one obstacle.
 
     f (3, 4): rotation and origin; motion (3, 3): rows are the origin's velocity and acceleration and the angular
-    velocity (constant), all in the base frame.
+    velocity (constant), all in the base frame; they count if the obstacle moves.
     """
-    ox, oy, oz = motion[2, 0], motion[2, 1], motion[2, 2]
     rx, ry, rz = p[0] - f[0, 3], p[1] - f[1, 3], p[2] - f[2, 3]
-    tx, ty, tz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx  # ω x r
-    sx, sy, sz = motion[0, 0] + tx, motion[0, 1] + ty, motion[0, 2] + tz  # the obstacle's velocity at p
-    ux, uy, uz = vel[0] - sx, vel[1] - sy, vel[2] - sz  # relative to it
-    x = (f[0, 0] * rx + f[1, 0] * ry + f[2, 0] * rz, f[0, 1] * rx + f[1, 1] * ry + f[2, 1] * rz,
-         f[0, 2] * rx + f[1, 2] * ry + f[2, 2] * rz)  # fmt: skip
-    w = (f[0, 0] * ux + f[1, 0] * uy + f[2, 0] * uz, f[0, 1] * ux + f[1, 1] * uy + f[2, 1] * uz,
-         f[0, 2] * ux + f[1, 2] * uy + f[2, 2] * uz)  # fmt: skip
-    d, second, a0, a1, a2 = core(kind, x, w, size, planes, first, end)
-    n0 = f[0, 0] * a0 + f[0, 1] * a1 + f[0, 2] * a2
-    n1 = f[1, 0] * a0 + f[1, 1] * a1 + f[1, 2] * a2
-    n2 = f[2, 0] * a0 + f[2, 1] * a1 + f[2, 2] * a2
-    # p̈ seen from the turning obstacle: minus a_o, minus ω x (ω x r), minus 2 ω x u
-    gx = acc[0] - motion[1, 0] - (oy * tz - oz * ty) - 2.0 * (oy * uz - oz * uy)
-    gy = acc[1] - motion[1, 1] - (oz * tx - ox * tz) - 2.0 * (oz * ux - ox * uz)
-    gz = acc[2] - motion[1, 2] - (ox * ty - oy * tx) - 2.0 * (ox * uy - oy * ux)
-    drift = -(n0 * sx + n1 * sy + n2 * sz)
-    return d, drift, second + n0 * gx + n1 * gy + n2 * gz, n0, n1, n2
+    sx = sy = sz = 0.0  # the obstacle's velocity at p
+    ux, uy, uz = vel  # of p relative to it
+    gx, gy, gz = acc  # p̈ as seen from it, without J a
+    if moves:
+        ox, oy, oz = motion[2, 0], motion[2, 1], motion[2, 2]
+        tx, ty, tz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx  # ω x r
+        sx, sy, sz = motion[0, 0] + tx, motion[0, 1] + ty, motion[0, 2] + tz
+        ux, uy, uz = ux - sx, uy - sy, uz - sz
+        # minus the origin's acceleration, minus ω x (ω x r), minus 2 ω x u
+        gx -= motion[1, 0] + (oy * tz - oz * ty) + 2.0 * (oy * uz - oz * uy)
+        gy -= motion[1, 1] + (oz * tx - ox * tz) + 2.0 * (oz * ux - ox * uz)
+        gz -= motion[1, 2] + (ox * ty - oy * tx) + 2.0 * (ox * uy - oy * ux)
+    if kind == SPHERE:  # round: no need of its frame
+        d, second, n0, n1, n2 = core(kind, (rx, ry, rz), (ux, uy, uz), size, planes, first, end)
+    else:
+        x = (f[0, 0] * rx + f[1, 0] * ry + f[2, 0] * rz, f[0, 1] * rx + f[1, 1] * ry + f[2, 1] * rz,
+             f[0, 2] * rx + f[1, 2] * ry + f[2, 2] * rz)  # fmt: skip
+        w = (f[0, 0] * ux + f[1, 0] * uy + f[2, 0] * uz, f[0, 1] * ux + f[1, 1] * uy + f[2, 1] * uz,
+             f[0, 2] * ux + f[1, 2] * uy + f[2, 2] * uz)  # fmt: skip
+        d, second, a0, a1, a2 = core(kind, x, w, size, planes, first, end)
+        n0 = f[0, 0] * a0 + f[0, 1] * a1 + f[0, 2] * a2
+        n1 = f[1, 0] * a0 + f[1, 1] * a1 + f[1, 2] * a2
+        n2 = f[2, 0] * a0 + f[2, 1] * a1 + f[2, 2] * a2
+    return d, -(n0 * sx + n1 * sy + n2 * sz), second + n0 * gx + n1 * gy + n2 * gz, n0, n1, n2
 
 
 @kernel
@@ -233,16 +248,17 @@ def rows_at(
     P, O, nv = len(joints), len(kinds), v.shape[1]
     p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
     Jp, n = np.empty((P, 3, nv)), np.empty(3)
+    moving = np.array([np.any(motions[o] != 0.0) for o in range(O)])
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
         row = 0
         for i in range(P):
             at = (p[i, 0], p[i, 1], p[i, 2])
-            moves, turns = (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2])
+            velocity, acceleration = (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2])
             for o in range(O):
                 d, h_t, second, n0, n1, n2 = _obstacle_row(
-                    at, moves, turns, kinds[o], sizes[o], planes, plane_start[o], plane_start[o + 1], frames[o],
-                    motions[o],
+                    at, velocity, acceleration, kinds[o], sizes[o], planes, plane_start[o], plane_start[o + 1],
+                    frames[o], motions[o], moving[o],
                 )  # fmt: skip
                 h[s, row] = d - radii[i] - margins[o]
                 drift[s, row], curvature[s, row] = h_t, second

@@ -24,6 +24,8 @@ from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_s
 from ppcbf_robots.world import Obstacle, WorldSpec
 from ppcbf_robots.world_files.load import load_world
 
+GUARDED = 0.99  # of X's velocities, where the filter's rows hold them: room for what happens within a control period
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -46,7 +48,7 @@ class Robot:
 
     def safety(self, obstacles: Sequence[Obstacle]) -> SafetyFunction:
         """Its safety function among obstacles, with the bounds of X as rows if the spec guards them."""
-        q, v = (self.domain.q, self.domain.v) if self.spec.domain.guard else (None, None)
+        q, v = (self.domain.q, GUARDED * self.domain.v) if self.spec.domain.guard else (None, None)
         return SafetyFunction(self.model, self.body, obstacles, domain=q, v_domain=v)
 
 

@@ -17,7 +17,7 @@ from ppcbf_robots.specs import Array
 
 NO_BOUND = 1e20  # ProxQP's infinity
 DAQP_NO_BOUND = 1e30  # DAQP's
-DAQP_OPTIMAL = 1  # its exit flag
+DAQP_OPTIMAL, DAQP_INFEASIBLE = 1, -1  # its exit flags
 
 
 class QPProblem(NamedTuple):
@@ -84,7 +84,13 @@ class ProxQPSolver:
 
 
 class DAQPSolver:
-    """DAQP, a dense dual active-set solver: exact to rounding, and it tells infeasible problems."""
+    """DAQP, a dense dual active-set solver: exact to rounding, and it tells infeasible problems.
+
+    Where it ends with neither an optimum nor a proof of infeasibility, ProxQP is asked.
+    """
+
+    def __init__(self) -> None:
+        self._second = ProxQPSolver()
 
     def solve(self, problem: QPProblem) -> Array | None:
         """(n,) solution, or None unless DAQP ends with an optimum."""
@@ -93,7 +99,9 @@ class DAQPSolver:
         upper[:n], upper[n:] = problem.box_high, DAQP_NO_BOUND
         lower[:n], lower[n:] = problem.box_low, problem.lower
         x, _, exit_flag, _ = daqp.solve(problem.H, problem.g, problem.C, upper, lower, np.zeros(n + m, dtype=np.int32))
-        return np.asarray(x) if exit_flag == DAQP_OPTIMAL else None
+        if exit_flag in (DAQP_OPTIMAL, DAQP_INFEASIBLE):
+            return np.asarray(x) if exit_flag == DAQP_OPTIMAL else None
+        return self._second.solve(problem)
 
 
 class QPSolversSolver:

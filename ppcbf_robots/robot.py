@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits
-from ppcbf_robots.kernels import points_at
+from ppcbf_robots.kernels import mirror, points_at
 from ppcbf_robots.meshes import Meshes
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, vector
 from ppcbf_robots.urdf import check_urdf
@@ -137,7 +137,6 @@ class RobotModel:
         self.data = self.model.createData()
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
         self._oMi = _strided(self.data.oMi)
-        self._below = np.tril_indices(self.nv, -1)
         self._index_joints()
         names = self.joint_names
         self.u_max, self.v_max = force_limits(self.urdf, names, facts.joints, effort, velocity)
@@ -194,8 +193,8 @@ class RobotModel:
         Minv = np.array(pin.computeMinverse(model, data, q))
         pin.computeJointJacobiansTimeVariation(model, data, q, v)
         M, g = data.M.copy(), data.g.copy()
-        below = self._below
-        M[below], Minv[below] = M.T[below], Minv.T[below]  # Pinocchio fills the upper triangles
+        mirror(M)  # Pinocchio fills the upper triangles
+        mirror(Minv)
         dyn = Dynamics(
             q=q.copy(),
             v=v.copy(),
@@ -267,6 +266,8 @@ class RobotModel:
 
     def q_rate(self, q: Array, v: Array) -> Array:
         """q̇ in Pinocchio's coordinates (..., nq): v for scalar joints, (-sin, cos) v for continuous ones."""
+        if not self._any_continuous:
+            return v
         return np.asarray((self.rate_const + self.rate_sign * q[..., self.rate_partner]) * v[..., self.rate_v])
 
     def parse_angles(self, values: Sequence[float], what: str) -> Array:

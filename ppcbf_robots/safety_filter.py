@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.barriers import Barrier, RhoBarrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.shapes import Motion, Packed
 from ppcbf_robots.specs import Array
 
 log = logging.getLogger(__name__)
@@ -31,6 +33,7 @@ class StepResult:
     h: float  # least over the rows [m | rad]
     phi: float  # least over the rows
     row: str  # name of the row that decided, "" if none
+    port_power: float = 0.0  # [W] beyond d_p that a moving obstacle puts in through the arm's evasion
 
 
 class SafetyFilter:
@@ -62,6 +65,8 @@ class SafetyFilter:
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
         self.correction = (ClosedForm if self.config.kind == "closed-form" else QPFilter)(barrier, safety, self.config)
+        learned = isinstance(barrier, RhoBarrier)
+        self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
         self._last_status = Status.FREE
         self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
@@ -73,7 +78,15 @@ class SafetyFilter:
         """Forget the last state, for a clock that starts anew."""
         self._last, self._invalid_steps = None, 0
 
-    def step(self, t: float, q: ArrayLike, v: ArrayLike, u_des: ArrayLike, d_p: float | None = None) -> StepResult:
+    def step(
+        self,
+        t: float,
+        q: ArrayLike,
+        v: ArrayLike,
+        u_des: ArrayLike,
+        d_p: float | None = None,
+        motions: Mapping[str, Motion] | None = None,
+    ) -> StepResult:
         """One control step.
 
         Args:
@@ -83,6 +96,9 @@ class SafetyFilter:
             u_des: desired torque (nv,) [N m | N].
             d_p: dissipation of the desired torque [W], the budget of the passivity row ``vᵀ(u - u_des) <= d_p``;
                 None leaves that row out (for controllers that are not passive).
+            motions: obstacles, by name, that are elsewhere than in the world's file or moving. K_theta was not trained
+                for that: while any is given, the filter runs on the LB-CBF (K = 0). Where one comes closer, the
+                passivity row yields to it, and what that puts in is ``port_power``. An unknown name or NaN is a FAULT.
 
         Returns:
             A finite torque, inside the box unless the filter is the closed form, and its status.
@@ -92,25 +108,38 @@ class SafetyFilter:
         if problem:
             self._invalid_steps += 1
             return self._count(self._hold(t, problem))
-        return self._count(self.filter(t, self.robot.evaluate(q, v), u_des, d_p))
+        dyn = self.robot.evaluate(q, v)
+        try:
+            obstacles = self.safety.packed.moved(motions) if motions else None
+        except InputError as error:
+            offset = 0.0 if self.gravity_included else dyn.g
+            return self._count(StepResult(self._fallback(dyn) - offset, Status.FAULT, str(error), np.nan, np.nan, ""))
+        return self._count(self.filter(t, dyn, u_des, d_p, obstacles))
 
-    def filter(self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None) -> StepResult:
-        """The step for a state that was already evaluated (and checked)."""
+    def filter(
+        self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None, obstacles: Packed | None = None
+    ) -> StepResult:
+        """The step for a state that was already evaluated (and checked), with the obstacles where they are now."""
         self._last, self._invalid_steps = (t, dyn.g), 0
-        rows = self.barrier.rows(dyn, self.safety.evaluate(dyn))
+        safety = self.safety.evaluate(dyn, obstacles)
+        rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
         wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
         if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
             u = self._fallback(dyn) - offset
             return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")
-        c = self.correction.correct(dyn, rows, u_des + offset, d_p, self.robot.u_max)
+        pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
+        budget = None if pushed else d_p
+        c = self.correction.correct(dyn, rows, u_des + offset, budget, self.robot.u_max)
         if c.status is Status.FAULT:
             return StepResult(self._fallback(dyn) - offset, c.status, c.reason, h, phi, self._name(c.row))
         status = c.status
         if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
             status = Status.RESTING
-        return StepResult(c.u - offset, status, c.reason, h, phi, self._name(c.row))
+        u = c.u - offset
+        port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
+        return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
 
     def _fallback(self, dyn: Dynamics) -> Array:
         """``sat(g - K_d v)``: kinetic energy cannot grow under it."""

@@ -10,11 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ppcbf_robots.engines import PinocchioEngine
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.qp import make_solver
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety_filter import SafetyFilter
+from ppcbf_robots.shapes import Motion
 from ppcbf_robots.specs import BarrierSpec
 
 ALARMS = (Status.FAULT, Status.INVALID, Status.STOP)
@@ -244,3 +246,112 @@ def test_alarms_are_logged_once_per_change(two_link, caplog):
 def test_config_is_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         FilterConfig().alpha = 3.0
+
+
+# ---------------------------------------------------------------------------------------------- obstacles that move
+
+
+def drive_ball(problem, start, velocity, goal, duration):
+    """The ball of the world moves from ``start`` at constant velocity while the arm holds or seeks its goal.
+
+    Returns least h, largest torque over its limit, statuses, energy put in at the obstacle's port and rise of V [J].
+    """
+    model, barrier = problem.model, problem.barrier("lb-cbf")
+    controller = problem.robot.controller.with_goal(goal)
+    filter_ = SafetyFilter(model, problem.safety, barrier, damping=controller.gains.kd)
+    engine = PinocchioEngine(model)
+    engine.reset(problem.robot.start, np.zeros(model.nv))
+    least, torque, port, statuses, V = np.inf, 0.0, 0.0, [], []
+    for i in range(round(duration / 1e-3)):
+        t = i * 1e-3
+        q, v = engine.state()
+        ball = Motion(xyz=start + t * velocity, velocity=velocity)
+        nominal = controller.evaluate(model.evaluate(q, v))
+        result = filter_.step(t, q, v, nominal.u, float(nominal.d_p), {"ball": ball})
+        least, torque = min(least, result.h), max(torque, float(np.max(np.abs(result.u) / model.u_max)))
+        port += 1e-3 * result.port_power
+        statuses.append(result.status)
+        V.append(float(nominal.V))
+        engine.advance(result.u, 5e-4, 2)
+    rise = float(np.max(np.array(V) - np.minimum.accumulate(V)))
+    return least, torque, statuses, port, rise
+
+
+def test_a_ball_driven_at_a_resting_arm_is_evaded(panda):
+    """The arm rests at its goal; a ball comes at its hand with 0.2 m/s and pushes it away without touching it."""
+    hand = panda.safety.points.kinematics(panda.model.evaluate(panda.robot.start, np.zeros(7))).p[-1]
+    away = np.array([0.0, 0.35, 0.0])
+    start = panda.robot.start
+    least, torque, statuses, port, rise = drive_ball(panda, hand + away, np.array([0.0, -0.2, 0.0]), start, 2.0)
+    assert least > -1e-3
+    assert torque <= 1.0 + 1e-9
+    assert Status.CORRECTING in statuses and Status.INFEASIBLE not in statuses
+    assert rise > 0.05  # the obstacle does work on the arm,
+    assert port == pytest.approx(rise, rel=0.5)  # and it is accounted at its port
+
+
+def test_a_ball_driven_across_a_moving_arm_is_avoided(panda):
+    velocity = np.array([0.0, -0.15, 0.0])
+    least, torque, statuses, _, _ = drive_ball(panda, np.array([0.5, 0.3, 0.5]), velocity, panda.robot.goal, 4.0)
+    assert least > -1e-3
+    assert torque <= 1.0 + 1e-9
+    assert Status.CORRECTING in statuses
+
+
+def test_without_its_motion_the_same_ball_hits(panda, monkeypatch):
+    """Told only where the ball is, not how it moves, the filter comes too late: the terms of the motion are needed."""
+    hand = panda.safety.points.kinematics(panda.model.evaluate(panda.robot.start, np.zeros(7))).p[-1]
+    monkeypatch.setattr("ppcbf_robots.shapes.Packed.moved", without_velocity(type(panda.safety.packed).moved))
+    start = hand + np.array([0.0, 0.35, 0.0])
+    least, *_ = drive_ball(panda, start, np.array([0.0, -1.0, 0.0]), panda.robot.start, 0.4)
+    monkeypatch.undo()
+    told, *_ = drive_ball(panda, start, np.array([0.0, -1.0, 0.0]), panda.robot.start, 0.4)
+    assert least < told - 5e-3
+
+
+def without_velocity(moved):
+    """``Packed.moved`` that forgets velocities."""
+    return lambda packed, motions: moved(
+        packed, {k: dataclasses.replace(m, velocity=np.zeros(3)) for k, m in motions.items()}
+    )
+
+
+@pytest.mark.parametrize("motion", [{"cat": Motion()}, {"ball": Motion(velocity=np.array([np.nan, 0.0, 0.0]))}])
+def test_a_motion_that_cannot_be_used_is_a_fault(panda, motion):
+    filter_ = SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf"))
+    result = filter_.step(0.0, panda.robot.start, np.zeros(7), np.zeros(7), 0.0, motion)
+    assert result.status is Status.FAULT
+    assert np.all(np.abs(result.u) <= panda.model.u_max)
+    assert "obstacle" in result.reason
+
+
+def test_learned_terms_are_left_out_while_an_obstacle_moves(panda, make_barrier):
+    learned = SafetyFilter(panda.model, panda.safety, make_barrier(panda, "pp-ncbf-convex"))
+    blind = SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf"))
+    v = np.full(7, 0.3)
+    u = panda.model.gravity(panda.robot.start)
+    args = 0.0, panda.robot.start, v, u, None, {"ball": Motion(xyz=np.array([0.5, 0.1, 0.5]))}
+    np.testing.assert_allclose(learned.step(*args).u, blind.step(*args).u)
+
+
+# ---------------------------------------------------------------------------------------------- the domain X
+
+
+def test_a_filtered_arm_stays_in_its_domain(panda):
+    """Torques that would race through the velocity and position ranges of X: every state stays inside."""
+    model, domain = panda.model, panda.robot.domain
+    filter_ = SafetyFilter(model, panda.safety, panda.barrier("lb-cbf"))
+    rng = np.random.default_rng(0)
+    engine = PinocchioEngine(model)
+    engine.reset(panda.robot.start, np.zeros(7))
+    fastest = np.zeros(7)
+    for i in range(2000):
+        q, v = engine.state()
+        if i % 400 == 0:
+            push = rng.choice([-1.0, 1.0], 7) * model.u_max
+        u = filter_.step(i * 1e-3, q, v, push).u
+        engine.advance(u, 5e-4, 2)
+        fastest = np.maximum(fastest, np.abs(v) / domain.v[:, 1])
+        assert np.all(np.abs(v) <= domain.v[:, 1])
+        assert np.all((q >= domain.q[:, 0] - 1e-3) & (q <= domain.q[:, 1] + 1e-3))
+    assert fastest.max() > 0.9  # it was tried

@@ -378,7 +378,7 @@ def test_start_inside_an_obstacle_or_beyond_a_limit(files):
         "the start configuration violates 'tip#1 / ball' by 0.1000: give another with --start or in the spec"
     )
     assert message(problem.check_start, np.array([-2.5, 0.0])).startswith(
-        "the start configuration violates 'shoulder lower limit' by 0.5000: "
+        "the start configuration violates 'shoulder lower limit' by 1.0000: "
     )
 
 
