@@ -9,6 +9,7 @@ import sys
 import typer
 from rich.text import Text
 
+from ppcbf_robots.cli.bench import bench
 from ppcbf_robots.cli.compare import compare
 from ppcbf_robots.cli.convert import convert
 from ppcbf_robots.cli.export import export
@@ -27,7 +28,7 @@ app = typer.Typer(
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
     "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed.",
 )
-for command in (info, train, simulate, compare, view, export, convert):
+for command in (bench, info, train, simulate, compare, view, export, convert):
     app.command()(command)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.benchmark import Case
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.rollout import Trajectory
@@ -144,3 +145,27 @@ def _save(fig: Any, path: Path, top: float = 1.0) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
     finally:
         plt.close(fig)
+
+
+def plot_bench(cases: Sequence[Case], robot: str, path: Path) -> None:
+    """Median and 99th percentile of a filter step against pairs (``robot``) and joints (all robots at 126 pairs)."""
+    fast = [c for c in cases if c.solver == cases[0].solver]
+    grown = sorted((c for c in fast if c.robot == robot), key=lambda c: c.pairs)
+    near = min(grown, key=lambda c: abs(c.pairs - 126))
+    wide = sorted([near, *(c for c in fast if c.robot != robot)], key=lambda c: c.joints)
+    fig, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
+    for ax, shown, key in zip(axes, (grown, wide), ("pairs", "joints"), strict=True):
+        x = [getattr(c, key) for c in shown]
+        bottom = np.zeros(len(shown))
+        for stage in shown[0].stages:
+            top = bottom + [c.stages[stage] for c in shown]
+            ax.fill_between(x, bottom, top, alpha=0.5, label=stage)
+            bottom = top
+        ax.plot(x, [c.median_us for c in shown], "k.-", label="whole step, median")
+        ax.plot(x, [c.p99_us for c in shown], "k.:", label="whole step, 99 %")
+        ax.set_xlabel("pairs of body sphere and obstacle" if key == "pairs" else "moving joints, at about 126 pairs")
+        ax.grid(alpha=0.3)
+        ax.set_ylim(bottom=0.0)
+    axes[0].set_ylabel("filter step [µs]")
+    axes[0].legend(frameon=False, fontsize=8)
+    _save(fig, path)

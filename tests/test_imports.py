@@ -36,7 +36,7 @@ OWNERS = {
     "scipy": ["shapes"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
-    "qpsolvers": ["qp"],
+    "qpsolvers": ["qp", "cli"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
     "mujoco": ["engine_mujoco"],
