@@ -20,6 +20,7 @@ from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.self_collision import self_pairs
 from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_spec, vector
 from ppcbf_robots.world import Obstacle, WorldSpec
 from ppcbf_robots.world_files.load import load_world
@@ -40,6 +41,7 @@ class Robot:
     start: Array  # (nq,)
     start_velocity: Array  # (nv,)
     derived: list[str]  # what was not in the spec and was derived
+    self_pairs: list[tuple[int, int]]  # body spheres that must not touch each other
 
     @property
     def goal(self) -> Array:
@@ -49,7 +51,7 @@ class Robot:
     def safety(self, obstacles: Sequence[Obstacle]) -> SafetyFunction:
         """Its safety function among obstacles, with the bounds of X as rows if the spec guards them."""
         q, v = (self.domain.q, GUARDED * self.domain.v) if self.spec.domain.guard else (None, None)
-        return SafetyFunction(self.model, self.body, obstacles, domain=q, v_domain=v)
+        return SafetyFunction(self.model, self.body, obstacles, True, q, v, self.self_pairs)
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class Problem:
             **({"position": self.robot.spec.position} if self.robot.spec.position else {}),
             "payload": None if self.robot.spec.payload is None else self.robot.spec.payload.model_dump(),
             "body": [s.model_dump() for s in self.robot.body],
+            **({"self_pairs": self.robot.self_pairs} if self.robot.self_pairs else {}),
         }
         gains, domain = self.robot.controller.gains, self.robot.domain
         task = {
@@ -148,7 +151,11 @@ def load_robot(name: str) -> Robot:
     gains = derive_gains(model, spec.controller, domain)
     controller = NominalController(model, gains, model.from_angles(goal))
     start_velocity = vector(velocity, model.nv, f"{path}: start_velocity")
-    return Robot(name, model, spec, body, domain, controller, model.from_angles(start), start_velocity, derived)
+    pairs, q_start = [], model.from_angles(start)
+    if spec.self_collision is not None:
+        srdf = spec.self_collision.srdf
+        pairs = self_pairs(model, body, q_start, None if srdf is None else path.parent / srdf)
+    return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs)
 
 
 def load_problem(robot: str, world: str) -> Problem:

@@ -99,6 +99,12 @@ class BarrierSpec(Spec):
     act_within: Positive | None = None  # [m]: closed form acts where h <= this, too
 
 
+class SelfCollisionSpec(Spec):
+    """Body spheres must not touch each other, but for neighbours and links whose collision the SRDF disables."""
+
+    srdf: str | None = None  # path beside the spec
+
+
 class RobotSpec(Spec):
     """A robot: its URDF and everything the URDF does not say. Only ``urdf`` is required."""
 
@@ -111,6 +117,7 @@ class RobotSpec(Spec):
     position: dict[str, tuple[float, float]] = {}
     controller: ControllerSpec | None = None
     body: list[BodyPrimitive] | None = None
+    self_collision: SelfCollisionSpec | None = None  # given: pairs of body spheres are rows too
     domain: DomainSpec = DomainSpec()
     start: list[float] | None = None
     start_velocity: list[float] | None = None

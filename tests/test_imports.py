@@ -20,7 +20,7 @@ LAYERS = [
     ["robot", "world_files"],
     ["safety", "controllers", "network", "engines"],
     ["condense"],
-    ["barriers", "derive", "qp"],
+    ["barriers", "derive", "qp", "self_collision"],
     ["filters"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco"],

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
+from pathlib import Path
+
 import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.problem import load_problem
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.shapes import Motion, Packed, pack, smoothing_gap
 from ppcbf_robots.specs import Array, BodySphere
@@ -305,3 +309,31 @@ def test_a_domain_tighter_than_the_limits_gives_rows(two_link):
     )
     name = two_link.model.joint_names[0]
     assert h[f"{name} lower limit"] == pytest.approx(0.2) and h[f"{name} upper limit"] == pytest.approx(0.7)
+
+
+SRDF = """<robot name="panda">
+  <disable_collisions link1="panda_hand" link2="panda_link3" reason="Never"/>
+</robot>"""
+
+
+def test_self_collision_on_request(tmp_path):
+    """Pairs of a spec with ``self_collision``: no neighbours, nothing disabled, and h is the spheres' distance."""
+    (tmp_path / "arm.srdf").write_text(SRDF)
+    text = Path(str(files("ppcbf_robots.robots") / "panda.yaml")).read_text()
+    (tmp_path / "all.yaml").write_text(text + "self_collision: {}\n")
+    (tmp_path / "some.yaml").write_text(text + "self_collision: {srdf: arm.srdf}\n")
+    (tmp_path / "none.yaml").write_text(text + "self_collision: {srdf: missing.srdf}\n")
+    everything, some = (load_problem(str(tmp_path / f"{name}.yaml"), "sphere") for name in ("all", "some"))
+    links = [{everything.robot.body[i].frame for i in pair} for pair in everything.robot.self_pairs]
+    assert {"panda_hand", "panda_link3"} in links and {"panda_link3", "panda_link4"} not in links
+    kept = [{some.robot.body[i].frame for i in pair} for pair in some.robot.self_pairs]
+    assert {"panda_hand", "panda_link3"} not in kept and 0 < len(kept) < len(links)
+    q = everything.robot.start
+    p = everything.safety.points.kinematics(everything.model.evaluate(q, np.zeros(7))).p
+    rows = everything.safety.evaluate(everything.model.evaluate(q, np.zeros(7)))
+    i, j = everything.robot.self_pairs[-1]
+    gap = np.linalg.norm(p[i] - p[j]) - everything.robot.body[i].radius - everything.robot.body[j].radius
+    assert rows.h[everything.safety.pairs - 1] == pytest.approx(gap)
+    assert everything.fingerprint()["robot"] != some.fingerprint()["robot"]
+    with pytest.raises(InputError, match="SRDF not found"):
+        load_problem(str(tmp_path / "none.yaml"), "sphere")
