@@ -15,17 +15,20 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from ppcbf_robots.body_geometry import Pieces, principal_axes
+from ppcbf_robots.body_geometry import SIDES, SPACING, SPACING_SHARE, Pieces, principal_axes
 from ppcbf_robots.specs import Array
 
 LARGEST = 0.040  # [m], overestimate aimed at
-THICKNESS_SHARE = 0.4  # of the middle extent: less is aimed at on thin links
-MEAN_SHARE = 0.45  # of the largest overestimate aimed at: what the mean should stay below
+THICKNESS_SHARE = 0.4  # of the middle extent: less is aimed at on thin links,
+SMALLEST = 0.020  # [m], but not less than this
+MEAN = 0.016  # [m], what the mean overestimate of a link should stay below,
+MEAN_SHARE = 0.45  # or this share of the largest one aimed at, if that is less
 MAX_BALLS = 8  # per joint
-POINTS = 500  # of the surface, that the search looks at
-TRIALS = 150  # moves tried per ball
+POINTS = 400  # of the surface, that the search looks at
+TRIALS = 100  # moves tried per ball
 GRID_POINTS = 20_000  # of the grid of distances that the search uses
 HOPELESS = 4.0  # times the aim: a start that costs more is not improved
+WORTH = 1.25  # times the least cost is accepted for fewer balls
 DIRECTIONS = 96  # of a ball's surface looked at in the search
 FINE_DIRECTIONS = 600  # and for the figures reported
 ROUND = 1e-4  # [m], of centres and radii; radii are rounded up
@@ -57,13 +60,23 @@ class Fit:
     overestimate: Overestimate
     aim: float  # [m], the largest overestimate aimed at
 
+    @property
+    def good(self) -> bool:
+        """Whether the overestimate is as small as aimed at."""
+        return self.overestimate.largest <= self.aim and self.overestimate.mean <= min(MEAN, MEAN_SHARE * self.aim)
+
+    @property
+    def cost(self) -> float:
+        """What the search makes small [m]."""
+        return _cost(self.overestimate, self.aim)
+
 
 class Surface:
     """A surface with what the search asks of it again and again."""
 
     def __init__(self, pieces: Pieces) -> None:
         self.pieces = pieces
-        self.aim = min(LARGEST, THICKNESS_SHARE * float(pieces.extent[1]))
+        self.aim = float(np.clip(THICKNESS_SHARE * pieces.extent[1], SMALLEST, LARGEST))
         self._tree = cKDTree(pieces.samples) if len(pieces.samples) else None
         rounded = np.flatnonzero(pieces.growth > 0.0)  # these are segments, perhaps of length 0
         self._ends = pieces.vertices[rounded][:, [0, -1]]
@@ -122,23 +135,31 @@ def outside(balls: Balls, directions: int) -> tuple[Array, Array]:
     return points[free], area[free]
 
 
-def fit(pieces: Pieces) -> Fit:
-    """The fewest balls, at most MAX_BALLS, whose overestimate is as small as aimed at, else the best found."""
-    surface = Surface(pieces)
-    best: Fit | None = None
-    for count in range(1, MAX_BALLS + 1):
-        found = _fit_count(surface, count, best)
-        if best is None or _cost(found.overestimate, found.aim) < _cost(best.overestimate, best.aim):
-            best = found
-        if good(best):
-            break
-    assert best is not None
-    return best
+def settings() -> list[float]:
+    """The numbers above, on which the result depends."""
+    search = [MAX_BALLS, POINTS, TRIALS, GRID_POINTS, HOPELESS, WORTH, DIRECTIONS, FINE_DIRECTIONS, ROUND]
+    return [LARGEST, THICKNESS_SHARE, SMALLEST, MEAN, MEAN_SHARE, *search, SPACING, SPACING_SHARE, SIDES]
 
 
-def good(fit: Fit) -> bool:
-    """Whether the overestimate is as small as aimed at."""
-    return fit.overestimate.largest <= fit.aim and fit.overestimate.mean <= MEAN_SHARE * fit.aim
+def fit(surface: Surface) -> Fit:
+    """The fewest balls whose overestimate is as small as aimed at; if there are none, those worth their number.
+
+    There are at most MAX_BALLS. A ball more is a row more in every control step: it must lower the cost by a quarter.
+    """
+    tried: list[Fit] = []
+    for count in range(_first_count(surface), MAX_BALLS + 1):
+        tried.append(_fit_count(surface, count, tried[-1] if tried else None))
+        if tried[-1].good:
+            return tried[-1]
+    least = min(f.cost for f in tried)
+    return next(f for f in tried if f.cost <= WORTH * least)
+
+
+def _first_count(surface: Surface) -> int:
+    """One less than a chain of balls takes that grows a round bar of this length and thickness by the aim."""
+    length, thickness, _ = surface.pieces.extent
+    chord = 2.0 * float(np.sqrt(surface.aim * (thickness + surface.aim)))
+    return int(np.clip(round(length / chord) - 1, 1, MAX_BALLS))
 
 
 def _fit_count(surface: Surface, count: int, fewer: Fit | None) -> Fit:
@@ -151,9 +172,11 @@ def _fit_count(surface: Surface, count: int, fewer: Fit | None) -> Fit:
         starts.append(np.concatenate([fewer.balls.centers, worst[None]]))
     zero = np.zeros(count)
     costs = [_search_cost(surface, c, surface.coarse.required(c), zero) for c in starts]
-    limit = max(min(costs), HOPELESS * surface.aim)
-    found = [refitted(surface, *_improved(surface, c, rng)) for c, x in zip(starts, costs, strict=True) if x <= limit]
-    return min(found, key=lambda f: _cost(f.overestimate, surface.aim))
+    promising = [c for c, x in zip(starts, costs, strict=True) if x <= HOPELESS * surface.aim]
+    if not promising:
+        return refitted(surface, starts[int(np.argmin(costs))], zero)
+    found = [refitted(surface, *_improved(surface, c, rng)) for c in promising]
+    return min(found, key=lambda f: f.cost)
 
 
 def refitted(surface: Surface, centers: Array, lead: Array) -> Fit:
@@ -235,7 +258,7 @@ def _clustered(pieces: Pieces, count: int, rng: np.random.Generator) -> Array:
 
 def _middles(points: Array, member: Array, count: int, default: Array) -> Array:
     """Centres of the nearly smallest ball around each group of points (Badoiu and Clarkson)."""
-    centers = default.copy()
+    centers: Array = default.copy()
     for i in range(count):
         group = points[member == i]
         if not len(group):

@@ -1,13 +1,15 @@
 """Collision shapes cut into small convex pieces, so that "a ball contains the shape" becomes a finite check.
 
 A piece is the convex hull of a few vertices, grown by a radius. A ball about c with radius R contains it if and only
-if ``|x - c| + growth <= R`` for each of its vertices x. Lengths are metres, all in the frame of the joint that carries
-the shape.
+if ``|x - c| + growth <= R`` for each of its vertices x. Lengths are metres, all in one frame fixed to the
+joint that carries the shape.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -39,7 +41,7 @@ class Pieces:
         columns = [np.linalg.norm(self.vertices - c, axis=2).max(axis=1) + self.growth for c in centers]
         return np.stack(columns, axis=1)
 
-    @property
+    @functools.cached_property
     def extent(self) -> Array:
         """(3,): lengths along the principal axes, falling."""
         points = self.vertices.reshape(-1, 3)
@@ -66,15 +68,16 @@ def digest(shapes: Iterable[pin.GeometryObject]) -> str:
     return found.hexdigest()
 
 
-def pieces_of(shapes: Iterable[pin.GeometryObject]) -> Pieces:
-    """Pieces of all ``shapes``, which one joint carries, in its frame.
+def pieces_of(shapes: Iterable[pin.GeometryObject], frame: pin.SE3 | None = None) -> Pieces:
+    """Pieces of all ``shapes``, which one joint carries, in that joint's frame or a ``frame`` fixed to it.
 
     Raises:
         UnknownShapeError: for a shape without triangles that is no box, sphere, cylinder or capsule.
     """
     objects = list(shapes)
     spacing = max([SPACING, *(SPACING_SHARE * _longest(o.geometry) for o in objects)])
-    return _joined([_placed(_pieces(o.geometry, spacing), o.placement) for o in objects])
+    frame = pin.SE3.Identity() if frame is None else frame
+    return _joined([_placed(_pieces(o.geometry, spacing), frame.actInv(o.placement)) for o in objects])
 
 
 def _longest(shape: coal.CollisionGeometry) -> float:
@@ -117,11 +120,15 @@ def _triangles(shape: coal.CollisionGeometry) -> tuple[Array, Array]:
     match shape:
         case coal.BVHModelBase():
             faces = [[shape.tri_indices(i)[k] for k in range(3)] for i in range(shape.num_tris)]
-            return np.asarray(shape.vertices()), np.array(faces, dtype=float).reshape(-1, 3)
+            vertices = np.asarray(shape.vertices())
         case coal.ConvexBase() if hasattr(shape, "polygons"):
             faces = [[shape.polygons(i)[k] for k in range(3)] for i in range(shape.num_polygons)]
-            return np.asarray(shape.points()), np.array(faces, dtype=float).reshape(-1, 3)
-    raise UnknownShapeError(f"a {type(shape).__name__} cannot be covered with spheres")
+            vertices = np.asarray(shape.points())
+        case _:
+            raise UnknownShapeError(f"a {type(shape).__name__} cannot be covered with spheres")
+    if not faces or not np.all(np.isfinite(vertices)):
+        raise UnknownShapeError("a mesh without triangles, or with vertices that are not finite")
+    return vertices, np.array(faces, dtype=float)
 
 
 def _box(half: Array) -> tuple[Array, Array]:
@@ -139,17 +146,17 @@ def _cylinder(radius: float, half: float, spacing: float) -> Pieces:
     arcs = np.stack([ring[:-1], corner, ring[1:]], axis=1)  # (SIDES, 3, 2)
     z = np.linspace(-half, half, 2 + int(2.0 * half / spacing))
     rows = 2 + int(radius / spacing)
-    shares = np.linspace(0.0, 1.0, rows)
-    side = [_lifted(arcs, a, arcs, b) for a, b in zip(z[:-1], z[1:], strict=True)]
-    ends = [_lifted(s * arcs, e, t * arcs, e) for e in (-half, half) for s, t in zip(shares[:-1], shares[1:], strict=True)]
+    side = [_lifted(arcs, a, arcs, b) for a, b in itertools.pairwise(z)]
+    rings = [share * arcs for share in np.linspace(0.0, 1.0, rows)]
+    ends = [_lifted(a, end, b, end) for end in (-half, half) for a, b in itertools.pairwise(rings)]
     vertices = np.concatenate(side + ends)
     return Pieces(vertices, np.zeros(len(vertices)), vertices[:, [0, 2, 3, 5]].mean(axis=1))
 
 
 def _lifted(lower: Array, z_lower: float, upper: Array, z_upper: float) -> Array:
     """(SIDES, 6, 3) from two plane arcs (SIDES, 3, 2) and their heights."""
-    parts = [np.concatenate([a, np.full((*a.shape[:2], 1), z)], axis=2) for a, z in ((lower, z_lower), (upper, z_upper))]
-    return np.concatenate(parts, axis=1)
+    heights = np.full((SIDES, 3, 1), z_lower), np.full((SIDES, 3, 1), z_upper)
+    return np.concatenate([np.concatenate([lower, heights[0]], 2), np.concatenate([upper, heights[1]], 2)], axis=1)
 
 
 def _subdivided(triangles: Array, spacing: float) -> Array:

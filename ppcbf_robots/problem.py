@@ -14,7 +14,8 @@ import numpy as np
 from ppcbf_robots.barriers import Barrier, BarrierKind, EnergyBarrier, RhoBarrier
 from ppcbf_robots.body import body_spheres
 from ppcbf_robots.controllers import NominalController
-from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_body, derive_domain, derive_gains
+from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_domain, derive_gains
+from ppcbf_robots.derive_body import Body, derive_body
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world
@@ -37,6 +38,7 @@ class Robot:
     start: Array  # (nq,)
     start_velocity: Array  # (nv,)
     derived: list[str]  # what was not in the spec and was derived
+    cover: Body | None = None  # how the body was fitted, if it was
 
     @property
     def goal(self) -> Array:
@@ -131,14 +133,16 @@ def load_robot(name: str) -> Robot:
     derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]
     derived += [f"domain.{k}" for k in ("q", "v") if getattr(spec.domain, k) is None]
     model.points([s.frame for s in spec.body or []], np.array([s.center for s in spec.body or []]))  # the frames exist
-    body = body_spheres(spec.body) if spec.body is not None else derive_body(model)
+    cover = derive_body(model) if spec.body is None else None
+    body = body_spheres(spec.body or []) if cover is None else cover.spheres
     start = _default_start(model, domain) if spec.start is None else vector(spec.start, model.nv, f"{path}: start")
     goal = _default_goal(start, domain) if spec.goal is None else vector(spec.goal, model.nv, f"{path}: goal")
     velocity = spec.start_velocity or [0.0] * model.nv
     gains = derive_gains(model, spec.controller, domain)
     controller = NominalController(model, gains, model.from_angles(goal))
     start_velocity = vector(velocity, model.nv, f"{path}: start_velocity")
-    return Robot(name, model, spec, body, domain, controller, model.from_angles(start), start_velocity, derived)
+    cover = cover if cover and cover.links else None
+    return Robot(name, model, spec, body, domain, controller, model.from_angles(start), start_velocity, derived, cover)
 
 
 def load_problem(robot: str, world: str) -> Problem:

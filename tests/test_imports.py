@@ -14,10 +14,10 @@ import pytest
 LAYERS = [
     ["errors"],
     ["specs", "resources"],
-    ["urdf", "world", "body"],
+    ["urdf", "world", "body", "body_geometry", "body_fit", "body_cache"],
     ["robot"],
     ["safety", "controllers", "network"],
-    ["barriers", "derive", "qp"],
+    ["barriers", "derive", "derive_body", "qp"],
     ["filters"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence"],
