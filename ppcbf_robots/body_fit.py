@@ -246,7 +246,7 @@ def _along_axis(pieces: Pieces, count: int) -> Array:
 def _clustered(pieces: Pieces, count: int, rng: np.random.Generator) -> Array:
     """Centres (count, 3) of clusters: farthest points first, then Lloyd's steps towards the middles."""
     points = pieces.vertices.mean(axis=1)
-    centers = points[[int(rng.integers(len(points)))]]
+    centers: Array = points[[int(rng.integers(len(points)))]]
     while len(centers) < count:
         far = np.linalg.norm(points[:, None] - centers, axis=2).min(axis=1).argmax()
         centers = np.concatenate([centers, points[[far]]])
