@@ -142,15 +142,15 @@ def settings() -> list[float]:
 
 
 def fit(surface: Surface) -> Fit:
-    """The fewest balls whose overestimate is as small as aimed at; if there are none, those worth their number.
+    """Ever more balls, at most MAX_BALLS, until the overestimate is as small as aimed at; of these the ones worth it.
 
-    There are at most MAX_BALLS. A ball more is a row more in every control step: it must lower the cost by a quarter.
+    Every ball is a row more in every control step, so the fewest are taken whose cost is within a quarter of the least.
     """
     tried: list[Fit] = []
     for count in range(_first_count(surface), MAX_BALLS + 1):
         tried.append(_fit_count(surface, count, tried[-1] if tried else None))
         if tried[-1].good:
-            return tried[-1]
+            break
     least = min(f.cost for f in tried)
     return next(f for f in tried if f.cost <= WORTH * least)
 
