@@ -173,9 +173,8 @@ def _fit_count(surface: Surface, count: int, fewer: Fit | None) -> Fit:
     zero = np.zeros(count)
     costs = [_search_cost(surface, c, surface.coarse.required(c), zero) for c in starts]
     promising = [c for c, x in zip(starts, costs, strict=True) if x <= HOPELESS * surface.aim]
-    if not promising:
-        return refitted(surface, starts[int(np.argmin(costs))], zero)
-    found = [refitted(surface, *_improved(surface, c, rng)) for c in promising]
+    found = [refitted(surface, starts[int(np.argmin(costs))], zero)]
+    found += [refitted(surface, *_improved(surface, c, rng)) for c in promising]
     return min(found, key=lambda f: f.cost)
 
 
