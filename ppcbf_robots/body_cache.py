@@ -9,8 +9,6 @@ import tempfile
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import ValidationError
-
 from ppcbf_robots.specs import Spec
 
 S = TypeVar("S", bound=Spec)
@@ -33,7 +31,7 @@ def recall(key: str, kind: type[S]) -> S | None:
     try:
         checksum, text = (place / f"{key}.json").read_text(encoding="utf-8").split("\n", 1)
         return kind.model_validate_json(text) if checksum == _checksum(text) else None
-    except (OSError, ValueError, ValidationError):
+    except (OSError, ValueError):  # pydantic's errors are ValueErrors
         return None
 
 

@@ -32,6 +32,7 @@ OWNERS = {
     "qpsolvers": ["qp"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
     "matplotlib": ["plots"],
+    "scipy": ["body_fit"],
     "pydantic": ["specs"],
     "yaml": ["specs"],
     "typer": ["cli"],
