@@ -64,6 +64,8 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
         "controller": gains.kind,
         "derived": robot.derived,
         "body": [s.model_dump() for s in robot.body],
+        "body_overestimate_mm": _overestimate(robot),
+        "body_links": _links(robot),
         "start": model.to_angles(robot.start).tolist(),
         "goal": model.to_angles(robot.goal).tolist(),
         "domain": {"q": robot.domain.q.tolist(), "v": robot.domain.v.tolist()},
@@ -82,6 +84,23 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
         if goal_h < 0.0:
             warnings.append(f"the goal violates '{goal_row}' by {-goal_h:.4f}: the arm will rest before it")
     return facts
+
+
+def _overestimate(robot: Robot) -> dict[str, float] | None:
+    """How far the spheres' outside lies from the geometry [mm]; None where they were not fitted to it."""
+    cover = robot.cover
+    return None if cover is None else {"largest": _mm(cover.largest), "mean": _mm(cover.mean)}
+
+
+def _links(robot: Robot) -> list[dict[str, Any]]:
+    """The same for every link, with the number of its spheres and of those that are left out."""
+    links = [] if robot.cover is None else robot.cover.links
+    return [{"link": x.link, "spheres": len(x.moving), "left_out": len(x.still), "largest": _mm(x.largest),
+             "mean": _mm(x.mean)} for x in links]  # fmt: skip
+
+
+def _mm(metres: float) -> float:
+    return round(1e3 * metres, 2)
 
 
 def u_des_outside(robot: Robot, rng: np.random.Generator) -> tuple[float, str]:
@@ -111,6 +130,12 @@ def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
     table("moving joints", ["joint", "position", "max speed", "max effort", "kp", "kd", "max spring"], rows)
     spheres = [[s["frame"], ", ".join(f"{x:.3f}" for x in s["center"]), f"{s['radius']:.3f}"] for s in facts["body"]]
     table(f"body: {len(spheres)} spheres, metres", ["frame", "centre", "radius"], spheres)
+    if facts["body_overestimate_mm"]:
+        fits = [[x["link"], str(x["spheres"]), str(x["left_out"]), f"{x['largest']:.1f}", f"{x['mean']:.1f}"]
+                for x in facts["body_links"]]  # fmt: skip
+        total = facts["body_overestimate_mm"]
+        title = f"body reaches {total['largest']:.1f} mm beyond the geometry at most, {total['mean']:.1f} mm on average"
+        table(title, ["link", "spheres", "left out", "largest", "mean"], fits)
     out.print("derived, not given: " + (", ".join(facts["derived"]) or "nothing"))
     out.print("start " + " ".join(f"{x:.3f}" for x in facts["start"]))
     out.print("goal  " + " ".join(f"{x:.3f}" for x in facts["goal"]))

@@ -9,6 +9,7 @@ import numpy as np
 from ppcbf_robots.specs import BodyPrimitive, BodySphere
 
 CAPSULE_GROWTH = 0.05  # of its radius: how much larger the spheres are that stand for a capsule
+CAPSULE_SPACING = 0.01  # [m], at least this far apart, or a thin capsule would be thousands of spheres
 
 
 def body_spheres(primitives: Sequence[BodyPrimitive]) -> list[BodySphere]:
@@ -17,12 +18,12 @@ def body_spheres(primitives: Sequence[BodyPrimitive]) -> list[BodySphere]:
 
 
 def _spheres(p: BodyPrimitive) -> list[BodySphere]:
-    """A capsule of radius r is covered by spheres of radius R = 1.05 r at most ``2 sqrt(R² - r²)`` apart."""
+    """A capsule of radius r is covered by spheres of radius R, 1.05 r or more, at most ``2 sqrt(R² - r²)`` apart."""
     if p.to is None:
         return [BodySphere(frame=p.frame, center=p.center, radius=p.radius)]
     start, end = np.array(p.center), np.array(p.to)
-    R = (1.0 + CAPSULE_GROWTH) * p.radius
-    spacing = max(2.0 * np.sqrt(R**2 - p.radius**2), 1e-3)
+    R = max((1.0 + CAPSULE_GROWTH) * p.radius, float(np.hypot(p.radius, 0.5 * CAPSULE_SPACING)))
+    spacing = 2.0 * np.sqrt(R**2 - p.radius**2)
     count = 1 + int(np.ceil(np.linalg.norm(end - start) / spacing))
     return [
         BodySphere(frame=p.frame, center=[float(x) for x in start + s * (end - start)], radius=R)

@@ -1,14 +1,13 @@
-"""What a plain URDF does not say, derived from the model: domain X, gains, body spheres, start and goal."""
+"""What a plain URDF does not say, derived from the model: domain X, gains, start and goal."""
 
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 
 from ppcbf_robots.controllers import Gains
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.robot import RobotModel
-from ppcbf_robots.specs import Array, BodySphere, ControllerSpec, DomainSpec, per_joint
+from ppcbf_robots.specs import Array, ControllerSpec, DomainSpec, per_joint
 
 SAMPLES = 1000  # configurations over which gravity and inertia are bounded; with 200 rare light postures are missed
 SAMPLE_SEED = 0
@@ -107,92 +106,3 @@ def _damping_modes(kd: Array, Minv: Array) -> tuple[Array, Array]:
     root = np.sqrt(kd)
     values, vectors = np.linalg.eigh(root[:, None] * Minv * root)
     return values, vectors
-
-
-def derive_body(robot: RobotModel) -> list[BodySphere]:
-    """Spheres along every moving link: along the principal axis of its collision geometry, as thick as most of it.
-
-    Links without readable geometry get spheres from their joint to the next one. Spheres that no joint moves (a first
-    link turning about its own axis) are left out: nothing the controller does moves them.
-    """
-    vertices = _collision_vertices(robot)
-    reach = sum(float(np.linalg.norm(T.translation)) for T in list(robot.model.jointPlacements)[1:])
-    thickness = float(np.clip(0.06 * reach, 0.01, 0.08))
-    spheres: list[BodySphere] = []
-    for joint in range(1, robot.model.njoints):
-        frame = _joint_frame(robot, joint)
-        points = vertices.get(joint)
-        segments = [_principal_segment(points)] if points is not None and len(points) > 3 else [
-            (np.zeros(3), end, thickness) for end in _segment_ends(robot, joint)]  # fmt: skip
-        for start, end, radius in segments:
-            count = 1 + int(np.ceil(np.linalg.norm(end - start) / max(1.4 * radius, 0.02)))
-            for s in np.linspace(0.0, 1.0, count):
-                center = [round(float(x), 4) for x in frame.placement.actInv(start + s * (end - start))]
-                spheres.append(BodySphere(frame=frame.name, center=center, radius=round(radius, 4)))
-    return _without_still_ones(robot, spheres)
-
-
-def _principal_segment(points: Array) -> tuple[Array, Array, float]:
-    """Segment and radius of the capsule along the points' principal axis that holds 90 % of their cross-section."""
-    mean = points.mean(axis=0)
-    axis = np.linalg.svd(points - mean, full_matrices=False)[2][0]
-    along = (points - mean) @ axis
-    off = points - mean - along[:, None] * axis
-    middle = (off.max(axis=0) + off.min(axis=0)) / 2.0
-    radius = float(np.percentile(np.linalg.norm(off - middle, axis=1), 90))
-    radius = max(radius, 0.005)
-    low, high = float(along.min()) + radius, float(along.max()) - radius
-    if high < low:
-        low = high = 0.5 * (low + high)
-    return mean + middle + low * axis, mean + middle + high * axis, radius
-
-
-def _joint_frame(robot: RobotModel, joint: int) -> pin.Frame:
-    bodies = [f for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY]
-    return bodies[0] if bodies else robot.model.frames[robot.model.getFrameId(robot.model.names[joint])]
-
-
-def _segment_ends(robot: RobotModel, joint: int) -> list[Array]:
-    """Where the link leads to, in the joint's frame: its child joints, else its farthest frame or centre of mass."""
-    model = robot.model
-    children = [model.jointPlacements[c].translation for c in range(1, model.njoints) if model.parents[c] == joint]
-    if children:
-        return [np.array(c) for c in children]
-    ends = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
-    ends.append(np.array(model.inertias[joint].lever))
-    return [max(ends, key=lambda e: float(np.linalg.norm(e)))]
-
-
-def _collision_vertices(robot: RobotModel) -> dict[int, Array]:
-    """Vertices of the collision geometry per joint, in the joint's frame; empty where none can be read."""
-    try:
-        geometry = robot.geometry(pin.GeometryType.COLLISION)
-    except (ValueError, RuntimeError):
-        return {}
-    found: dict[int, list[Array]] = {}
-    for shape in geometry.geometryObjects:
-        points = _shape_vertices(shape)
-        placed = points @ shape.placement.rotation.T + shape.placement.translation
-        found.setdefault(int(shape.parentJoint), []).append(placed)
-    return {joint: np.concatenate(parts) for joint, parts in found.items()}
-
-
-def _shape_vertices(shape: pin.GeometryObject) -> Array:
-    if hasattr(shape.geometry, "vertices") and callable(shape.geometry.vertices):
-        return np.asarray(shape.geometry.vertices())  # already scaled by meshScale
-    shape.geometry.computeLocalAABB()
-    box = shape.geometry.aabb_local
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    low: Array = np.asarray(box.min_)
-    return low + corners * (np.asarray(box.max_) - low)
-
-
-def _without_still_ones(robot: RobotModel, spheres: list[BodySphere]) -> list[BodySphere]:
-    points = robot.points([s.frame for s in spheres], np.array([s.center for s in spheres]))
-    rng = np.random.default_rng(SAMPLE_SEED)
-    motion = np.zeros(len(spheres))
-    for angles in rng.uniform(-1.0, 1.0, (20, robot.nv)):
-        J = points.kinematics(robot.evaluate(robot.from_angles(angles), np.zeros(robot.nv))).J
-        motion = np.maximum(motion, np.abs(J).max(axis=(1, 2)))
-    moving = [s for s, m in zip(spheres, motion, strict=True) if m > 1e-3]
-    return moving or spheres

@@ -14,7 +14,8 @@ import numpy as np
 from ppcbf_robots.barriers import Barrier, BarrierKind, EnergyBarrier, RhoBarrier
 from ppcbf_robots.body import body_spheres
 from ppcbf_robots.controllers import NominalController
-from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_body, derive_domain, derive_gains
+from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_domain, derive_gains
+from ppcbf_robots.derive_body import Body, derive_body
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world
@@ -42,6 +43,7 @@ class Robot:
     start_velocity: Array  # (nv,)
     derived: list[str]  # what was not in the spec and was derived
     self_pairs: list[tuple[int, int]]  # body spheres that must not touch each other
+    cover: Body | None = None  # how the body was fitted, if it was
 
     @property
     def goal(self) -> Array:
@@ -144,18 +146,20 @@ def load_robot(name: str) -> Robot:
     derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]
     derived += [f"domain.{k}" for k in ("q", "v") if getattr(spec.domain, k) is None]
     model.points([s.frame for s in spec.body or []], np.array([s.center for s in spec.body or []]))  # the frames exist
-    body = body_spheres(spec.body) if spec.body is not None else derive_body(model)
+    cover = derive_body(model) if spec.body is None else None
+    body = body_spheres(spec.body or []) if cover is None else cover.spheres
     start = _default_start(model, domain) if spec.start is None else vector(spec.start, model.nv, f"{path}: start")
     goal = _default_goal(start, domain) if spec.goal is None else vector(spec.goal, model.nv, f"{path}: goal")
     velocity = spec.start_velocity or [0.0] * model.nv
     gains = derive_gains(model, spec.controller, domain)
     controller = NominalController(model, gains, model.from_angles(goal))
     start_velocity = vector(velocity, model.nv, f"{path}: start_velocity")
+    cover = cover if cover and cover.links else None
     pairs, q_start = [], model.from_angles(start)
     if spec.self_collision is not None:
         srdf = spec.self_collision.srdf
         pairs = self_pairs(model, body, q_start, None if srdf is None else path.parent / srdf)
-    return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs)
+    return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, cover)
 
 
 def load_problem(robot: str, world: str) -> Problem:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,8 +25,17 @@ States = Callable[..., Iterator[tuple[Array, Array]]]
 AlongMotion = Callable[..., tuple[Dynamics, Dynamics]]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The tests share a cache of fitted bodies of their own."""
+    path = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(path))
+        yield path
+
+
 @pytest.fixture(scope="session")
-def problems() -> dict[str, Problem]:
+def problems(cache_folder: Path) -> dict[str, Problem]:
     """Every robot of the tests in its world, by the robot's name; kinova has continuous joints."""
     return {robot: load_problem(robot, world) for robot, world in PAIRS.items()}
 

@@ -113,7 +113,8 @@ def in_tmp_path(tmp_path, monkeypatch) -> None:
 def test_info_of_a_robot(robot, nv):
     found = facts("info", robot)
     assert found.keys() >= {"robot", "urdf", "nq", "nv", "joints", "locked", "controller", "derived", "body", "start",
-                            "goal", "domain", "warnings", "u_des_outside", "lb_infeasible"}  # fmt: skip
+                            "body_overestimate_mm", "body_links", "goal", "domain", "warnings", "u_des_outside",
+                            "lb_infeasible"}  # fmt: skip
     assert found["nv"] == len(found["joints"]) == len(found["start"]) == len(found["goal"]) == nv
     assert found["nq"] == nv + sum(j["continuous"] for j in found["joints"])
     assert all((j["lower"] is None) == (j["upper"] is None) == j["continuous"] for j in found["joints"])
@@ -124,6 +125,21 @@ def test_info_of_a_robot(robot, nv):
     assert text.stdout.startswith(f"{found['robot']}  {found['urdf']}\nnq {found['nq']}, nv {nv}")
     assert f"body: {len(found['body'])} spheres" in text.stdout
     assert all(f"warning: {w}" in text.stdout for w in found["warnings"])
+
+
+def test_info_says_how_far_the_fitted_body_reaches_beyond_the_geometry():
+    found = facts("info", "ur5")
+    total, links = found["body_overestimate_mm"], found["body_links"]
+    assert [x["link"] for x in links] == ["shoulder_link", "upper_arm_link", "forearm_link"] + [
+        f"wrist_{i}_link" for i in (1, 2, 3)
+    ]
+    assert sum(x["spheres"] for x in links) == len(found["body"])
+    assert total["largest"] == max(x["largest"] for x in links) < 45.0
+    assert min(x["mean"] for x in links) < total["mean"] < max(x["mean"] for x in links)
+    line = f"body reaches {total['largest']:.1f} mm beyond the geometry at most, {total['mean']:.1f} mm on average"
+    assert line in run_cli("info", "ur5").stdout
+    given = facts("info", "panda")
+    assert (given["body_overestimate_mm"], given["body_links"]) == (None, [])
 
 
 def test_every_bundled_robot_is_tested():

@@ -15,12 +15,12 @@ LAYERS = [
     ["errors"],
     ["specs", "resources", "kernels"],
     ["network_kernel"],
-    ["urdf", "urdf_parts", "world", "body"],
+    ["urdf", "urdf_parts", "world", "body", "body_geometry", "body_fit", "body_cache"],
     ["shapes", "world_shapes", "joints", "meshes"],
     ["robot", "world_files"],
     ["safety", "controllers", "network", "engines"],
     ["condense"],
-    ["barriers", "derive", "qp", "self_collision"],
+    ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["filters"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco"],
@@ -33,7 +33,7 @@ LAYERS = [
 
 OWNERS = {
     "numba": ["kernels"],
-    "scipy": ["shapes"],
+    "scipy": ["shapes", "body_fit"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
