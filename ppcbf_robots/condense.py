@@ -13,12 +13,13 @@ from ppcbf_robots.kernels import kernel
 @kernel
 def condense(
     phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
-    alpha: float, margin: float, flat: float, tolerance: float, C: Any, lower: Any, norm: Any, binding: Any,
+    alpha: float, speed_alpha: float, margin: float, flat: float, tolerance: float,
+    C: Any, lower: Any, norm: Any, binding: Any,
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill the rows ``C z >= lower`` of ``z = (u - u_des) / u_max``.
 
     Rows 0 to R are ``psi_k(u) >= -alpha (phi_k - margin)``, then follow for every joint of ``v_domain``
-    ``v̇ >= -alpha (v - lowest)`` and ``-v̇ >= -alpha (highest - v)``, which keep it in the velocity domain.
+    ``v̇ >= -speed_alpha (v - lowest)`` and ``-v̇ >= -speed_alpha (highest - v)``, which keep it in the velocity domain.
 
     Args:
         phi, Lf: (R,).
@@ -27,6 +28,7 @@ def condense(
         v_domain: (nv, 2), or (0, 2) for no such rows.
         u_des, u_max: (nv,).
         alpha: class-K gain [1/s].
+        speed_alpha: that of the velocity domain [1/s].
         margin: kept off phi.
         flat: length of a row, in units of phi̇ per full torque, below which no torque steers it.
         tolerance: by which a row may be out of reach of the box before it counts as hopeless.
@@ -46,7 +48,7 @@ def condense(
         if k < R:
             slack = Lf[k] + alpha * (phi[k] - margin)
         else:
-            slack = alpha * sign * (v[joint] - v_domain[joint, 0 if sign > 0 else 1])
+            slack = speed_alpha * sign * (v[joint] - v_domain[joint, 0 if sign > 0 else 1])
         length = 0.0
         for j in range(nv):
             g = Lg[k, j] if k < R else sign * Minv[joint, j]

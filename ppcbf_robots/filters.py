@@ -33,6 +33,7 @@ _TINY = 1e-12
 _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
+SPEED_SHARE = 0.3  # of the way to the bound of the velocity domain that one control period may go
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
@@ -62,6 +63,11 @@ class FilterConfig:
     near_rows: int = 16  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
     dt: float = 1e-3  # [s], control period
+
+    @property
+    def speed_alpha(self) -> float:
+        """Class-K gain [1/s] of the rows that keep the velocity domain: late, yet within a few control periods."""
+        return SPEED_SHARE / self.dt
 
     def __post_init__(self) -> None:
         """Refuse what would disable a constraint without a word."""
@@ -182,7 +188,8 @@ class QPFilter:
         binding = np.empty(count, dtype=np.bool_)
         hopeless, hold = condense(
             rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
+            alpha, self.config.speed_alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE,
+            C, lower, norm, binding,
         )  # fmt: skip
         return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold
 

@@ -113,7 +113,7 @@ def speed_rows(dyn, v_domain, u_des, alpha):
 def reference_qp(dyn, rows, u_des, d_p, u_max, barrier, config, v_domain=()):
     """The whole QP, every row at once, by DAQP: the torque, or None if infeasible."""
     H = weight(dyn, config.metric) * np.outer(u_max, u_max)
-    speed, slack = speed_rows(dyn, v_domain, u_des, config.alpha)
+    speed, slack = speed_rows(dyn, v_domain, u_des, 0.3 / config.dt)
     C = np.vstack([rows.Lg_phi, speed]) * u_max
     lower = -np.concatenate([qp_slack(barrier, rows, u_des, config), slack])
     if d_p is not None:

@@ -28,7 +28,6 @@ from ppcbf_robots.world import WorldSpec
 FAR = {"name": "far", "type": "sphere", "center": [50.0, 0.0, 0.0], "radius": 0.1}
 BALL = {"name": "ball", "type": "sphere", "center": [0.5, 0.0, 0.5], "radius": 0.1}
 BOX = {"name": "box", "type": "box", "xyz": [0.5, 0.0, 0.5], "rpy": [0.0, 0.0, 0.4], "size": [0.2, 0.15, 0.2]}
-UNCOVERED = 0.03  # [m]: the bundled spheres leave that much of the Panda's forearm out, so the obstacles get a margin
 
 SPECS = {
     "payload": {"urdf": "panda", "payload": {"frame": "panda_hand", "mass": 2.5, "com": [0.05, -0.02, 0.1]},
@@ -290,7 +289,7 @@ def test_the_log_keeps_first_time_and_largest_depth():
 
 
 def test_the_panda_touches_a_ball_only_without_the_filter(load):
-    problem = load("panda", BALL | {"margin": UNCOVERED})
+    problem = load("panda", BALL)
     passed, hit = run(problem, 3.0, filtered=True), run(problem, 1.0)
     assert passed.active.sum() > 500
     assert passed.clearance.min() > 0.0
@@ -309,10 +308,7 @@ def test_the_panda_touches_a_box_without_the_filter(panda):
 
 
 def test_the_panda_passes_a_box_with_the_filter(load):
-    try:
-        problem = load("panda", BOX | {"margin": UNCOVERED})
-    except AttributeError:
-        pytest.skip("safety functions know spheres and half-spaces only")
+    problem = load("panda", BOX)
     passed = run(problem, 3.0, filtered=True)
     assert passed.active.sum() > 500
     assert passed.meta["contacts"] == {"steps": 0, "pairs": []}
