@@ -34,7 +34,7 @@ SPECS = {
                 "locked": {"panda_joint3": 0.7, "panda_joint6": 1.9, "panda_finger_joint1": 0.01,
                            "panda_finger_joint2": 0.03}},
     "locked continuous": {"urdf": "kinova", "locked": {"j2s6s200_joint_1": 2.0, "j2s6s200_joint_5": -0.8}},
-    "branching": {"urdf": "allegro_left_hand"},
+    "branching": {"urdf": "allegro_left_hand", "moving": [f"joint_{i}.0" for i in range(8)]},
 }  # fmt: skip
 ROBOTS = ["panda", "ur5", "kinova", "cartpole", "two_link", "xarm7", *SPECS]
 
@@ -226,24 +226,21 @@ def test_a_margin_is_not_solid(toy):
 
 BEAM = '<collision name="beam"><origin xyz="0.3 0 0" rpy="0 1.57079632679 0"/><geometry>{}</geometry></collision>'
 LINKS = {
-    "box": ('<box size="0.1 0.1 0.2"/>', "", 0.4),
-    "sphere": ('<sphere radius="0.15"/>', "", 0.45),
-    "cylinder": ('<cylinder radius="0.05" length="0.4"/>', "", 0.5),
-    "capsule": ('<cylinder radius="0.05" length="0.4"/>', '<capsule name="beam"/>', 0.55),
-    "mesh": ('<mesh filename="{tmp}/wedge.obj" scale="2 2 2"/>', "", 0.4),
-    "convex": ('<mesh filename="{tmp}/wedge.obj" scale="2 2 2"/>', '<convex name="beam"/>', 0.4),
-    "unreadable": ('<mesh filename="missing.stl"/>', "", 0.6),  # the body sphere stands for the link
+    "box": ('<box size="0.1 0.1 0.2"/>', 0.4),
+    "sphere": ('<sphere radius="0.15"/>', 0.45),
+    "cylinder": ('<cylinder radius="0.05" length="0.4"/>', 0.5),
+    "mesh": ('<mesh filename="{tmp}/wedge.obj" scale="2 2 2"/>', 0.4),
+    "unreadable": ('<mesh filename="missing.stl"/>', 0.6),  # the body sphere stands for the link
 }
 WEDGE = "v 0 0 0.05\nv 0.05 -0.05 -0.05\nv -0.05 -0.05 -0.05\nv 0 0.05 -0.05\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
 
 
 @pytest.mark.parametrize("kind", LINKS)
 def test_shapes_of_links(kind, toy, tmp_path):
-    """``reach`` is where along x the link ends; ``stands_for`` is Pinocchio's extension of URDF."""
+    """``reach`` is where along x the link ends."""
     (tmp_path / "wedge.obj").write_text(WEDGE)
-    shape, stands_for, reach = LINKS[kind]
-    beam = BEAM.format(shape.format(tmp=tmp_path))
-    problem = toy(f"{beam}<collision_checking>{stands_for}</collision_checking>")
+    shape, reach = LINKS[kind]
+    problem = toy(BEAM.format(shape.format(tmp=tmp_path)))
     (contact,) = contacts_at(problem, 0.0, FAR | {"center": [reach + 0.099, 0.0, 0.0]})
     assert contact.depth == pytest.approx(0.001, abs=1e-5)
     assert contacts_at(problem, 0.0, FAR | {"center": [reach + 0.101, 0.0, 0.0]}) == []

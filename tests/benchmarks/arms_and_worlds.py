@@ -1,0 +1,162 @@
+"""Every arm in every world: train, then move from one side of the obstacle to the other in MuJoCo with contacts on.
+
+The bundled worlds are scaled to each arm's reach and set before its first joint. Start and goal are drawn on opposite
+sides (left and right of the arm's middle plane), clear of everything by 2 cm, with an obstacle on the straight path
+between them. One JSON object per case is appended to the output; cases already there are skipped.
+
+Run: ``python tests/benchmarks/arms_and_worlds.py --out runs/arms.jsonl``, then ``--table`` for the README's table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ppcbf_robots import load_problem
+from ppcbf_robots.benchmark import measure
+from ppcbf_robots.cli.simulate import choose_barrier, run
+from ppcbf_robots.cli.train import train_barrier
+from ppcbf_robots.problem import Problem, load_robot
+from ppcbf_robots.resources import find_world
+from ppcbf_robots.robot import RobotModel
+from ppcbf_robots.specs import Array
+from ppcbf_robots.world_files.load import load_world
+from ppcbf_robots.world_files.write import write_world
+
+ARMS = ("panda", "panda_collision", "ur3", "ur5", "ur10", "kinova", "z1", "xarm7", "talos_left_arm", "baxter_left")
+WORLDS = ("table_boxes", "shelf", "pillar")
+SIZED_FOR = 0.85  # [m], reach of the arms that the bundled worlds suit, whose first joint is at z = 0.333
+SHOULDER = 0.333  # [m]
+DURATION = 15.0  # [s]
+
+
+def reach(model: RobotModel) -> float:
+    """Length of the chain from the first joint to the last [m]."""
+    return sum(float(np.linalg.norm(T.translation)) for T in list(model.model.jointPlacements)[2:]) + 0.1
+
+
+def fitted_world(model: RobotModel, world: str, folder: Path) -> Path:
+    """The bundled world, scaled and moved to the arm, as a file."""
+    scale = reach(model) / SIZED_FOR
+    first = model.evaluate(model.from_angles(np.zeros(model.nv)), np.zeros(model.nv)).placements[1, :3, 3]
+    origin = first - np.array([0.0, 0.0, scale * SHOULDER])
+    spec = load_world(find_world(world))
+    moved = []
+    for o in spec.obstacles:
+        change: dict[str, Any] = {k: scale * getattr(o, k) for k in ("radius", "length") if hasattr(o, k)}
+        if hasattr(o, "size"):
+            change["size"] = [scale * x for x in o.size]
+        for key in ("xyz", "center"):
+            if hasattr(o, key):
+                change[key] = (origin + scale * np.array(getattr(o, key))).tolist()
+        if hasattr(o, "normal"):
+            change["offset"] = scale * o.offset + float(origin @ np.array(o.normal))
+        moved.append(o.model_copy(update=change))
+    path = folder / f"{world}.yaml"
+    write_world(spec.model_copy(update={"obstacles": moved}), path, f"{world} for this arm", overwrite=True)
+    return path
+
+
+def clearance(problem: Problem, angles: Array) -> tuple[float, float, float]:
+    """Least distance to an obstacle, least h of all rows, and y of the tip against the first joint [m]."""
+    model = problem.model
+    dyn = model.evaluate(model.from_angles(angles), np.zeros(model.nv))
+    h = problem.safety.evaluate(dyn).h
+    tip = problem.safety.points.kinematics(dyn).p[-1]
+    return float(h[: problem.safety.pairs].min()), float(h.min()), float(tip[1] - dyn.placements[1, 1, 3])
+
+
+def draw_task(problem: Problem, rng: np.random.Generator, tries: int = 4000) -> tuple[Array, Array] | None:
+    """Start and goal angles on opposite sides, or None if no straight path between such meets an obstacle."""
+    domain, side = problem.robot.domain, 0.15 * reach(problem.model)
+    left, right = [], []
+    for angles in domain.sample_q(rng, tries):
+        distance, least, y = clearance(problem, angles)
+        if distance >= 0.02 and least > 0.0 and abs(y) > side:
+            (left if y > 0 else right).append(angles)
+    for start, goal in zip(left, right, strict=False):
+        path = start + np.linspace(0.0, 1.0, 31)[:, None] * (goal - start)
+        if min(clearance(problem, x)[0] for x in path) <= -0.02:
+            return start, goal
+    return None
+
+
+def case(arm: str, world: str, folder: Path, time_limit: float) -> dict[str, Any]:
+    """Train and run one arm in one world."""
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    problem = load_problem(arm, str(fitted_world(load_robot(arm).model, world, folder)))
+    task = draw_task(problem, np.random.default_rng(0))
+    facts: dict[str, Any] = {"arm": arm, "world": world, "pairs": problem.safety.pairs}
+    if task is None:
+        return facts | {"note": "no task found"}
+    start, goal = (problem.model.from_angles(x) for x in task)
+    problem = problem.with_goal(goal)
+    report = train_barrier(problem, "pp-ncbf", "default", 0, folder / "barrier", "cpu", None, time_limit)
+    barrier, config = choose_barrier(problem, str(folder / "barrier"), None, None)
+    assert barrier is not None
+    trajectory = run(problem, barrier, config, start, np.zeros(problem.model.nv), DURATION, {}, "mujoco")
+    trajectory.save(folder / "run.npz")
+    keep = ("clearance", "contacts", "max_torque_ratio", "energy_rise", "reached_goal", "goal_error", "rests_on")
+    summary = trajectory.summary(problem.model)
+    error = [np.abs(problem.model.difference(q, goal)).max() for q in trajectory.q[::20]]
+    arrived = np.flatnonzero(np.array(error) < 0.05)
+    times = measure(problem, barrier, config, 1000)
+    return facts | {k: summary[k] for k in keep} | {
+        "arrived": float(trajectory.t[::20][arrived[0]]) if len(arrived) else None,
+        "converged": report["converged"], "violations": report["violations"], "samples": report["samples"],
+        "volume_kept": report["volume_kept"], "train_s": report["seconds"], "filter_us": times.median_us,
+        "seconds": round(time.monotonic() - began, 1),
+    }  # fmt: skip
+
+
+def table(path: Path) -> None:
+    """The README's table from the output file."""
+    print("| arm | world | pairs | least clearance [mm] | contacts | largest torque | V rise / V0 | goal | trained [s] "
+          "| violations | filter [µs] |\n|---|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+    for line in path.read_text().splitlines():
+        c = json.loads(line)
+        if "note" in c:
+            print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {c['note']} | | | | | | | |")
+            continue
+        goal = f"{c['arrived']:.1f} s" if c["arrived"] else f"rests on {c['rests_on']}" if c["rests_on"] else "under way"
+        print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {1e3 * c['clearance']:.1f} | {c['contacts']} "
+              f"| {c['max_torque_ratio']:.2f} | {c['energy_rise']:.0e} | {goal} | {c['train_s']:.0f} "
+              f"| {c['violations']} of {c['samples']} | {c['filter_us']:.0f} |")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/arms.jsonl"))
+    parser.add_argument("--arms", nargs="*", default=list(ARMS))
+    parser.add_argument("--worlds", nargs="*", default=list(WORLDS))
+    parser.add_argument("--time-limit", type=float, default=240.0)
+    parser.add_argument("--table", action="store_true", help="print the table of what is there")
+    args = parser.parse_args()
+    logging.disable(logging.CRITICAL)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    if args.table:
+        table(args.out)
+        return
+    done = set()
+    if args.out.exists():
+        done = {(c["arm"], c["world"]) for c in map(json.loads, args.out.read_text().splitlines())}
+    for world in args.worlds:
+        for arm in args.arms:
+            if (arm, world) in done:
+                continue
+            facts = case(arm, world, args.out.parent / f"{arm}_{world}", args.time_limit)
+            print(json.dumps(facts), file=sys.stderr)
+            with args.out.open("a") as file:
+                file.write(json.dumps(facts) + "\n")
+
+
+if __name__ == "__main__":
+    main()
