@@ -80,10 +80,15 @@ def samples_of(geometry: coal.CollisionGeometry, rng: np.random.Generator, count
 
 
 def uncovered(triangles: Array, centers: Array, radii: Array) -> Array:
-    """What is left of triangles (N, 3, 3) after halving them until each part lies in one ball, down to a micrometre."""
+    """What is not covered of triangles (N, 3, 3): they are halved until each part lies in one ball.
+
+    Parts with a corner outside all balls, or still in no ball at a micrometre, are returned.
+    """
     while len(triangles):
-        held = (np.linalg.norm(triangles[:, :, None] - centers, axis=3) <= radii + 1e-6).all(axis=1).any(axis=1)
-        triangles = triangles[~held]
+        inside = np.linalg.norm(triangles[:, :, None] - centers, axis=3) <= radii + 1e-6  # (N, 3, balls)
+        if not inside.any(axis=2).all():
+            return triangles[~inside.any(axis=2).all(axis=1)]
+        triangles = triangles[~inside.all(axis=1).any(axis=1)]
         edges = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
         if np.any(edges.max(axis=1, initial=0.0) < 1e-6):
             return triangles
