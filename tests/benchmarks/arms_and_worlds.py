@@ -126,7 +126,9 @@ def table(path: Path) -> None:
         if "note" in c:
             print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {c['note']} | | | | | | | |")
             continue
-        goal = f"{c['arrived']:.1f} s" if c["arrived"] else f"rests on {c['rests_on']}" if c["rests_on"] else "under way"
+        goal = (
+            f"{c['arrived']:.1f} s" if c["arrived"] else f"rests on {c['rests_on']}" if c["rests_on"] else "under way"
+        )
         print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {1e3 * c['clearance']:.1f} | {c['contacts']} "
               f"| {c['max_torque_ratio']:.2f} | {c['energy_rise']:.0e} | {goal} | {c['train_s']:.0f} "
               f"| {c['violations']} of {c['samples']} | {c['filter_us']:.0f} |")  # fmt: skip
