@@ -101,6 +101,11 @@ class QPRows:
     binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
     barrier_rows: int
 
+    def without_speed(self) -> QPRows:
+        """The barrier's rows alone."""
+        n = self.barrier_rows
+        return QPRows(self.C[:n], self.lower[:n], self.norm[:n], self.binding[:n], n)
+
 
 class ClosedForm:
     """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
@@ -173,7 +178,8 @@ class QPFilter:
 
     Rows are ``psi_k(u) >= -alpha (phi_k - margin)`` (PP-CBF: alpha = gamma_K, no margin), the velocity domain's, and
     ``vᵀ δ <= d_p``. The near rows are those closest to violation by u_des, each in units of the correction it needs;
-    the others are checked afterwards and join if they are violated, so the answer satisfies all rows.
+    the others are checked afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
+    solution, the velocity domain is given up first, then passivity; then the least violation is sought.
     """
 
     def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
@@ -206,9 +212,12 @@ class QPFilter:
             z = self._least_violation(dyn, qp, box, u_max)
             return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, hopeless)
         passivity = self._passivity_row(dyn, d_p, u_max)
-        solved = self._solve(dyn, qp, passivity, box, u_max)
+        solved, reason = self._solve(dyn, qp, passivity, box, u_max), "constraint active"
+        if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
+            qp, reason = qp.without_speed(), "constraint active, the velocity domain given up"
+            solved = self._solve(dyn, qp, passivity, box, u_max)
         if solved is not None:
-            return self._answer(solved[0], u_des, u_max, Status.CORRECTING, "constraint active", solved[1])
+            return self._answer(solved[0], u_des, u_max, Status.CORRECTING, reason, solved[1])
         if passivity is not None:
             solved = self._solve(dyn, qp, None, box, u_max)
         if solved is not None:
@@ -255,10 +264,7 @@ class QPFilter:
         return None
 
     def _least_violation(self, dyn: Dynamics, qp: QPRows, box: Box, u_max: Array) -> Array | None:
-        """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted.
-
-        The velocity domain is given up here: leaving it is better than an obstacle.
-        """
+        """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted."""
         n = len(u_max)
         steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
         if not len(steerable):

@@ -33,7 +33,7 @@ class Preset:
     margin: float = 0.03  # dimensionless reserve the critics ask for in training
     random_goals: float = 0.0  # share of states whose nominal torque aims at a random goal
     rays: int = 20_000
-    rows_per_ray: int = 6
+    rows_per_ray: int = 8
     iterations: int = 800  # planned; the learning rate falls to a tenth over them
     check_every: int = 50  # iterations between checks on fresh states
     patience: int = 6  # clean checks in a row, without gain of volume, that end training early

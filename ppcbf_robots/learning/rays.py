@@ -94,26 +94,6 @@ class Field:
             rays.h, hdot, rays.grad, s2 * rays.eta, rays.Minv, rays.g + s2 * rays.beta, self.gamma, K, K_q_rate, K_v
         )
 
-    def speed_rows(self, rays: Rays, s: torch.Tensor, v_domain: torch.Tensor, gain: float, count: int) -> BarrierRows:
-        """Rows that keep the velocity domain (nv, 2), the ``count`` nearest; phi in units such that ``alpha phi`` fits.
-
-        Args:
-            rays: B rays.
-            s: (B,) where on them.
-            v_domain: lowest and highest velocity of every joint.
-            gain: class-K gain of these rows over that of the others.
-            count: how many per state.
-        """
-        v = s[:, None] * rays.d
-        b = rays.g + (s * s)[:, None] * rays.beta
-        sign = torch.where(v >= 0.0, -1.0, 1.0)  # of the bound that the joint moves towards
-        room = torch.where(v >= 0.0, v_domain[:, 1] - v, v - v_domain[:, 0])
-        near = (room / (v_domain[:, 1] - v_domain[:, 0])).topk(count, largest=False).indices  # (B, count)
-        w = sign.gather(1, near)[..., None] * torch.eye(v.shape[1], device=v.device, dtype=v.dtype)[near]
-        Lg = w @ rays.Minv
-        phi = gain * room.gather(1, near)
-        return BarrierRows(phi, phi, -(Lg @ b[..., None])[..., 0], Lg, w)
-
     @torch.no_grad()
     def on_band(self, params: Params, rays: Rays, level: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """s with ``min_k phi_k(s) = level`` by bisection, and which rays cross that level at all."""

@@ -28,7 +28,6 @@ LearnedKind = Literal["ncbf", "pp-ncbf"]
 CHECK_STATES = 4_000
 COUNTEREXAMPLE_COPIES = 50  # how often a counterexample's ray stands in the pool
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
-SPEED_ROWS = 3  # of the velocity domain, the nearest, in the critic
 CANDIDATES = 3  # clean parameter sets tried in the final check
 MAX_REFINED_MARGIN = 0.1
 
@@ -118,7 +117,6 @@ class Trainer:
         self.trained = [k for k in self.params if k not in CONSTANTS]
         self.optimizer = torch.optim.Adam([self.params[k].requires_grad_() for k in self.trained])
         self.field = Field(problem.model, preset.network, self.spec.gamma, self.device, self.dtype)
-        self._v_domain = self._tensor(problem.safety.v_domain)
         self._u_max = self._tensor(problem.model.u_max)
         self._kd = self._tensor(problem.robot.controller.gains.kd)
         self._p_ref = float(problem.model.u_max @ np.abs(problem.robot.domain.v).max(axis=1))
@@ -232,23 +230,11 @@ class Trainer:
             torque, passivity = closed_form_critics(rows, v, u_des, d_p, self._u_max, p.metric, margin, self._p_ref)
         else:
             passive = self.kind == "pp-ncbf"
-            row, box = feasibility_margin(
-                self._with_speed(rows, rays, s), v, u_des, d_p, self._u_max, self.filter_config.alpha, passive
-            )
+            row, box = feasibility_margin(rows, v, u_des, d_p, self._u_max, self.filter_config.alpha, passive)
             torque, passivity = torch.relu(margin - row), torch.relu(-box)
         if self.kind == "ncbf":
             passivity = torch.zeros_like(passivity)
         return rows, torque, passivity
-
-    def _with_speed(self, rows: BarrierRows, rays: Rays, s: torch.Tensor) -> BarrierRows:
-        """The rows of phi and the nearest of those that keep the velocity domain, as the runtime QP has them."""
-        if not len(self._v_domain):
-            return rows
-        config, count = self.filter_config, min(SPEED_ROWS, len(self._v_domain))
-        speed = self.field.speed_rows(rays, s, self._v_domain, config.speed_alpha / config.alpha, count)
-        return BarrierRows(
-            *(torch.cat([getattr(x, f.name) for x in (rows, speed)], 1) for f in dataclasses.fields(rows))
-        )
 
     def _step(self, phi: torch.Tensor, torque: torch.Tensor, passivity: torch.Tensor) -> None:
         """One gradient step on the loss (24) with R = 1 - sigmoid(phi), then the weights' update."""
