@@ -12,6 +12,7 @@ from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number
 from ppcbf_robots.evidence import check_band
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.problem import Problem, Robot, load_problem, load_robot
+from ppcbf_robots.shapes import smoothing_gap
 
 STATES = 2_000
 BAND_STATES = 1_000
@@ -76,6 +77,7 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
     if problem:
         check = check_band(problem, problem.barrier("lb-cbf"), FilterConfig(), BAND_STATES, rng)
         h, row = problem.safety.least(robot.start)
+        facts["smoothing_gap_mm"] = {o.name: 1e3 * smoothing_gap(o) for o in problem.world.obstacles}
         facts |= {"pairs": problem.safety.pairs, "lb_infeasible": check.share, "lb_samples": check.samples,
                   "start_clearance": h, "start_nearest": row}  # fmt: skip
         if h < 0.0:
@@ -144,7 +146,9 @@ def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
 
 def _print_world(problem: Problem, facts: dict[str, Any]) -> None:
     title = f"world {problem.world_name}: {problem.safety.pairs} pairs with the body"
-    table(title, ["obstacle", "type", ""], obstacle_rows(problem.world))
+    gaps = [f"{facts['smoothing_gap_mm'][o.name]:.1f}" for o in problem.world.obstacles]
+    rows = [[*row, gap] for row, gap in zip(obstacle_rows(problem.world), gaps, strict=True)]
+    table(title, ["obstacle", "type", "", "smoothing gap [mm]"], rows)
     out.print(f"start clearance {facts['start_clearance']:.4f} ({facts['start_nearest']})")
     share, n = facts["lb_infeasible"], facts["lb_samples"]
     if not n:

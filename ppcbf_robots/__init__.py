@@ -11,6 +11,7 @@ from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.rollout import Trajectory, simulate
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.safety_filter import SafetyFilter, StepResult
+from ppcbf_robots.shapes import Motion
 
 __version__ = "0.1.0"
 
@@ -19,6 +20,7 @@ __all__ = [
     "Dynamics",
     "FilterConfig",
     "InputError",
+    "Motion",
     "PPCBFError",
     "Problem",
     "Robot",

@@ -22,7 +22,7 @@ from ppcbf_robots.learning.critics import closed_form_critics, feasibility_margi
 from ppcbf_robots.learning.parameters import initial_parameters
 from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS
 from ppcbf_robots.learning.rays import FAR, Field, Rays, build_pool, rays_at, to_tensors
-from ppcbf_robots.learning.train import MIN_SAMPLES, Monitor, Result, Trainer, settings
+from ppcbf_robots.learning.train import MARGIN_GROWTH, MIN_SAMPLES, Monitor, Result, Trainer, settings
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -482,7 +482,7 @@ def test_violations_are_not_converged_and_refined(two_link, monkeypatch):
     trainer, result = train(two_link, on_refine=notes.append)
     assert (result.converged, result.reason) == (False, "3 of 300 uniform band states violate the limits")
     assert notes == ["3 of 300 uniform band states violate: refining"]
-    assert trainer.margin == pytest.approx(1.5 * TINY.margin)
+    assert trainer.margin == pytest.approx(MARGIN_GROWTH * TINY.margin)
     assert trainer.planned == TINY.iterations * 3 // 2
     assert len(trainer.counterexamples) == 1
 

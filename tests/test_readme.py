@@ -18,6 +18,7 @@ README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8"
 SMALLER = {
     "train": ["--iterations", "40"],
     "simulate": ["--duration", "0.2"],
+    "bench": ["--steps", "100"],
     "compare": ["--iterations", "30", "--duration", "0.3"],
 }
 
@@ -34,7 +35,7 @@ def commands() -> list[list[str]]:
 
 
 def test_the_readme_names_every_command() -> None:
-    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare", "convert"}
+    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare", "convert", "bench"}
 
 
 @pytest.mark.slow
@@ -49,8 +50,9 @@ def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pyt
         for name in ("--out", "--html"):
             if name in arguments:
                 assert Path(arguments[arguments.index(name) + 1]).exists(), arguments
+    names: dict[str, object] = {}  # each block goes on from the one before
     for block in blocks("python"):
-        exec(compile(block, "README.md", "exec"), {})
+        exec(compile(block, "README.md", "exec"), names)
 
 
 def test_yaml_examples_are_valid() -> None:

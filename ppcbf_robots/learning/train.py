@@ -29,6 +29,7 @@ CHECK_STATES = 4_000
 COUNTEREXAMPLE_COPIES = 50  # how often a counterexample's ray stands in the pool
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
 CANDIDATES = 3  # clean parameter sets tried in the final check
+MARGIN_GROWTH = 1.15  # per refinement; with 1.5 the paper's network gave up 4 % of its volume at once
 MAX_REFINED_MARGIN = 0.1
 
 
@@ -316,7 +317,7 @@ class Trainer:
     def _refine(self, tested: list[Tested]) -> None:
         """Counterexamples join the pool, the margin grows, and training goes on for half as long."""
         self.clean = []
-        self.margin = min(MAX_REFINED_MARGIN, 1.5 * self.margin)
+        self.margin = min(MAX_REFINED_MARGIN, MARGIN_GROWTH * self.margin)
         self.planned = self.iteration + self.preset.iterations // 2
         if any(t.check.violations for t in tested):
             q, v = (np.concatenate([getattr(t.check, k) for t in tested]) for k in ("bad_q", "bad_v"))
