@@ -13,7 +13,7 @@ from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.safety_filter import SafetyFilter, StepResult
 from ppcbf_robots.shapes import Motion
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "CheckFailed",

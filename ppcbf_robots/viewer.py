@@ -203,7 +203,9 @@ def _draw_obstacle(node: meshcat.Visualizer, obstacle: Obstacle, view: _View) ->
     """The solid itself, or a thin plate on the solid side of a plane, next to what is looked at."""
     if not isinstance(obstacle, HalfSpace):
         shape, placement = coal_shape(obstacle)
-        node.set_object(drawable(shape), _material(OBSTACLE_COLOR, 0.8))
+        node.set_object(
+            drawable(shape), _material(OBSTACLE_COLOR, 0.8 if isinstance(obstacle, Sphere) else 0.45)
+        )  # boxes hide what is behind them
         node.set_transform(placement)
         return
     normal, size = np.array(obstacle.normal), 2.6 * view.radius
