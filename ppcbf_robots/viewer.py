@@ -203,9 +203,8 @@ def _draw_obstacle(node: meshcat.Visualizer, obstacle: Obstacle, view: _View) ->
     """The solid itself, or a thin plate on the solid side of a plane, next to what is looked at."""
     if not isinstance(obstacle, HalfSpace):
         shape, placement = coal_shape(obstacle)
-        node.set_object(
-            drawable(shape), _material(OBSTACLE_COLOR, 0.8 if isinstance(obstacle, Sphere) else 0.45)
-        )  # boxes hide what is behind them
+        opacity = 0.8 if obstacle.type == "sphere" else 0.45  # boxes and pillars hide what is behind them
+        node.set_object(drawable(shape), _material(OBSTACLE_COLOR, opacity))
         node.set_transform(placement)
         return
     normal, size = np.array(obstacle.normal), 2.6 * view.radius
