@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from ppcbf_robots.errors import InputError
 from ppcbf_robots.robot import RobotModel
-from ppcbf_robots.specs import Array, BodySphere, read_text
+from ppcbf_robots.specs import Array, BodySphere
+from ppcbf_robots.urdf import parse_xml
 
 
 def self_pairs(robot: RobotModel, body: Sequence[BodySphere], start: Array, srdf: Path | None) -> list[tuple[int, int]]:
@@ -20,10 +19,9 @@ def self_pairs(robot: RobotModel, body: Sequence[BodySphere], start: Array, srdf
     Left out are spheres of one joint or of a joint and its parent, links whose collision the SRDF disables, and pairs
     that overlap already in ``start`` (nq,): there the spheres are coarser than the links, and no torque parts them.
     """
-    joints = robot.points([s.frame for s in body], np.array([s.center for s in body])).joints
-    parents = list(robot.model.parents)
-    disabled = set() if srdf is None else disabled_links(srdf)
     points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
+    joints, parents = points.joints, list(robot.model.parents)
+    disabled = set() if srdf is None else disabled_links(srdf)
     p = points.kinematics(robot.evaluate(start, np.zeros(robot.nv))).p
     found, touching = [], 0
     for i, j in combinations(range(len(body)), 2):
@@ -41,13 +39,5 @@ def self_pairs(robot: RobotModel, body: Sequence[BodySphere], start: Array, srdf
 
 def disabled_links(srdf: Path) -> set[frozenset[str]]:
     """Pairs of links named by ``<disable_collisions link1=... link2=...>``; InputError if the file is not an SRDF."""
-    text = read_text(srdf, "SRDF")
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{srdf}: an SRDF must not contain DOCTYPE or ENTITY declarations; remove them")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{srdf}: not valid XML ({error})") from None
-    if root.tag != "robot":
-        raise InputError(f"{srdf}: the root element is <{root.tag}>, an SRDF's is <robot>")
+    root = parse_xml(srdf, "SRDF")
     return {frozenset((str(e.get("link1")), str(e.get("link2")))) for e in root.iter("disable_collisions")}

@@ -45,7 +45,7 @@ def check_urdf(path: Path) -> UrdfFacts:
     Raises:
         InputError: naming the link or joint and the remedy.
     """
-    root = _parse(path)
+    root = parse_xml(path)
     links, joints = root.findall("link"), root.findall("joint")
     if not links:
         raise InputError(f"{path}: the URDF has no <link>")
@@ -66,10 +66,11 @@ def check_urdf(path: Path) -> UrdfFacts:
     return UrdfFacts(str(clean.get("name")), facts, clean, warnings)
 
 
-def _parse(path: Path) -> ElementTree.Element:
-    text = read_text(path, "URDF").lstrip("\ufeff")  # some editors begin a file with this mark
+def parse_xml(path: Path, what: str = "URDF") -> ElementTree.Element:
+    """Root element of a URDF or SRDF (``what``), or an InputError that says why not."""
+    text = read_text(path, what).lstrip("\ufeff")  # some editors begin a file with this mark
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{path}: a URDF must not contain DOCTYPE or ENTITY declarations; remove them")
+        raise InputError(f"{path}: a {what} must not contain DOCTYPE or ENTITY declarations; remove them")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -77,7 +78,7 @@ def _parse(path: Path) -> ElementTree.Element:
     if any("xacro" in element.tag for element in root.iter()):
         raise InputError(f"{path}: {XACRO}")
     if root.tag != "robot":
-        raise InputError(f"{path}: the root element is <{root.tag}>, a URDF's is <robot>")
+        raise InputError(f"{path}: the root element is <{root.tag}>, a {what}'s is <robot>")
     return root
 
 
