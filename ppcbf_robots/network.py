@@ -152,8 +152,8 @@ class NumpyNetwork:
         """Arguments of the compiled form behind q and v."""
         p = self.params
         layers = [(p[f"W{i}"], p[f"b{i}"]) for i in range(sum(f"W{i}" in p for i in range(len(p))))]
-        weights = np.concatenate([x.ravel() for layer in layers for x in layer])
-        widths = np.array([len(layers[0][0]), *(len(b) for _, b in layers)])
+        weights = np.concatenate([np.zeros(0), *(x.ravel() for layer in layers for x in layer)])
+        widths = np.array([len(p["in_shift"]), *(len(b) for _, b in layers)])
         common = weights, widths, p["in_shift"], p["in_scale"]
         if self.kind == "mlp":
             return *common, p["w_out"], float(p["b_out"]), float(p["zero_at_rest"])

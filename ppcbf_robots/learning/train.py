@@ -26,10 +26,9 @@ from ppcbf_robots.specs import Array
 
 LearnedKind = Literal["ncbf", "pp-ncbf"]
 CHECK_STATES = 4_000
-COUNTEREXAMPLE_COPIES = 50  # how often a counterexample's ray stands in the pool
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
 CANDIDATES = 3  # clean parameter sets tried in the final check
-MARGIN_GROWTH = 1.15  # per refinement; with 1.5 the paper's network gave up 4 % of its volume at once
+MARGIN_GROWTH = 1.15  # per refinement
 MAX_REFINED_MARGIN = 0.1
 
 
@@ -327,7 +326,7 @@ class Trainer:
         """Rays through states (q, v) join the pool, many times over."""
         rays, _ = rays_at(self.problem, q, v, self.rays.h.shape[1])
         found = Rays(**to_tensors([rays], self.device, self.dtype))
-        copies = torch.arange(len(found), device=self.device).repeat(COUNTEREXAMPLE_COPIES)
+        copies = torch.arange(len(found), device=self.device).repeat(self.preset.counterexample_copies)
         self.rays = self.rays.join(found.select(copies))
         self.counterexamples.append((q, v))
 
