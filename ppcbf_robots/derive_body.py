@@ -20,6 +20,7 @@ from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, BodySphere, Spec
 
 VERSION = 1  # of the algorithm: another one finds nothing in the cache
+MASSLESS = 1e-6  # [kg], links below which are no bodies but steps between joints
 STILL = 1e-3  # [m/rad | -], what moves less per unit of every joint stands still
 SNAP = 0.015  # [m], how far a centre is moved onto the axis about which it turns
 SAMPLES = 20  # configurations in which motion is looked for
@@ -65,12 +66,26 @@ def derive_body(robot: RobotModel) -> Body:
         robot: the model; what had to be replaced is added to its warnings.
     """
     shapes = _shapes(robot)
+    bare = [j for j in range(1, robot.model.njoints) if j not in shapes and robot.model.inertias[j].mass > MASSLESS]
     if not shapes:
         robot.warnings.append(
             "no collision or visual geometry can be read: body spheres stand along the links and may not contain them; "
             "check package_dirs, or give `body`"
         )
-        return Body(spheres=_along_links(robot), links=[])
+        moving, still = _along_links(robot, range(1, robot.model.njoints))
+        return Body(spheres=moving or still, links=[])
+    covered, (along, _) = _fitted(robot, shapes), _along_links(robot, bare)
+    if along:
+        names = ", ".join(f"'{_link(robot, joint).name}'" for joint in bare)
+        robot.warnings.append(
+            f"no geometry can be read at link {names}: body spheres stand along it and may not contain it; "
+            "check package_dirs, or give `body`"
+        )
+    return Body(spheres=[*covered.spheres, *along], links=covered.links)
+
+
+def _fitted(robot: RobotModel, shapes: dict[int, list[pin.GeometryObject]]) -> Body:
+    """The cover of all shapes, from the cache if it is there."""
     key = _key(robot, shapes)
     body = body_cache.recall(key, Body)
     if body is None:
@@ -181,20 +196,20 @@ def _link(robot: RobotModel, joint: int) -> pin.Frame:
     return bodies[0] if bodies else robot.model.frames[robot.model.getFrameId(robot.model.names[joint])]
 
 
-def _along_links(robot: RobotModel) -> list[BodySphere]:
-    """Spheres from every joint to the next one, as thick as suits the reach."""
+def _along_links(robot: RobotModel, joints: Sequence[int]) -> tuple[list[BodySphere], list[BodySphere]]:
+    """Spheres from joints to the next ones, as thick as suits the reach: those that a joint moves, and the others."""
     reach = sum(float(np.linalg.norm(T.translation)) for T in list(robot.model.jointPlacements)[1:])
     radius = float(np.clip(0.06 * reach, 0.01, 0.08))
     moving: list[BodySphere] = []
     still: list[BodySphere] = []
-    for joint in range(1, robot.model.njoints):
+    for joint in joints:
         link, (slope, offset) = _link(robot, joint), _motion(robot, joint)
         for end in _segment_ends(robot, joint):
             for s in np.linspace(0.0, 1.0, 1 + int(np.ceil(np.linalg.norm(end) / max(1.4 * radius, 0.02)))):
                 center = np.round(link.placement.actInv(s * end), 4)
                 sphere = BodySphere(frame=link.name, center=center.tolist(), radius=round(radius, 4))
                 (moving if np.abs(slope @ center + offset).max() > STILL else still).append(sphere)
-    return moving or still
+    return moving, still
 
 
 def _segment_ends(robot: RobotModel, joint: int) -> list[Array]:

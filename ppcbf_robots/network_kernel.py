@@ -38,7 +38,7 @@ def _hidden(x: Any, weights: Any, widths: Any, slopes: Any) -> Any:
 @kernel
 def _pull_back(g: Any, weights: Any, widths: Any, slopes: Any) -> Any:
     """Gradient with respect to the input from that with respect to the last hidden layer."""
-    at = len(weights)
+    at, g = len(weights), g.copy()
     for layer in range(len(widths) - 2, -1, -1):
         inputs, outputs = widths[layer], widths[layer + 1]
         at -= (inputs + 1) * outputs

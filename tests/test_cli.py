@@ -138,7 +138,7 @@ def test_info_says_how_far_the_fitted_body_reaches_beyond_the_geometry():
     assert min(x["mean"] for x in links) < total["mean"] < max(x["mean"] for x in links)
     line = f"body reaches {total['largest']:.1f} mm beyond the geometry at most, {total['mean']:.1f} mm on average"
     assert line in run_cli("info", "ur5").stdout
-    given = facts("info", "panda")
+    given = facts("info", "two_link")
     assert (given["body_overestimate_mm"], given["body_links"]) == (None, [])
 
 
