@@ -366,3 +366,35 @@ def test_contradictions_do_not_hold_up_the_loop():
         solver.solve(QPProblem(H * 2.0 / np.trace(H), np.zeros(2), np.array([c, d]), lower, -1.0 - u, 1.0 - u))
         longest = max(longest, time.process_time() - start)
     assert longest < 0.03
+
+
+# ---------------------------------------------------------------------------------------------- ladder
+
+
+def test_the_velocity_domain_gives_way_first(panda):
+    """Far beyond X's speeds no torque obeys its rows: the rest of the QP is solved without them, still passive."""
+    model, config = panda.model, FilterConfig()
+    barrier = panda.barrier("lb-cbf")
+    v = np.zeros(7)
+    v[0] = 2.0 * panda.robot.domain.v[0, 1]
+    dyn, rows = rows_at(panda, barrier, panda.robot.start, -v)
+    nominal = panda.robot.controller.evaluate(dyn)
+    answer = QPFilter(barrier, panda.safety, config).correct(dyn, rows, nominal.u, float(nominal.d_p), model.u_max)
+    assert answer.status is Status.CORRECTING and answer.reason.endswith("the velocity domain given up")
+    assert np.all(np.abs(answer.u) <= model.u_max)
+    assert -v @ (answer.u - nominal.u) <= float(nominal.d_p) + 1e-6
+    assert qp_slack(barrier, rows, answer.u, config).min() >= -1e-3
+
+
+def test_proxqp_stands_in_where_daqp_neither_solves_nor_refutes(monkeypatch):
+    problem = QPProblem(np.eye(2), np.zeros(2), np.array([[1.0, 0.0]]), np.array([0.5]), -np.ones(2), np.ones(2))
+    expected = [0.5, 0.0]
+    solver = make_solver("daqp")
+    np.testing.assert_allclose(solver.solve(problem), expected, atol=1e-9)
+    for flag, answer in ((-4, expected), (-2, expected), (-1, None)):
+        monkeypatch.setattr("ppcbf_robots.qp.daqp.solve", lambda *a, flag=flag: (np.full(2, 9.0), 0.0, flag, {}))
+        found = solver.solve(problem)
+        if answer is None:
+            assert found is None
+        else:
+            np.testing.assert_allclose(found, answer, atol=1e-6)
