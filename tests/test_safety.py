@@ -288,7 +288,7 @@ def test_self_collision_pairs_against_finite_differences(panda, states, along_mo
     model, dt = panda.model, 2e-5
     body = panda.robot.body
     safety = SafetyFunction(model, body, panda.safety.obstacles, joint_limits=False, self_pairs=[(0, 12), (1, 9)])
-    assert safety.pairs == len(body) + 2 and safety.names[-1] == "panda_link3#1 / panda_hand#9"
+    assert safety.pairs == len(body) + 2 and safety.names[-1] == f"{body[1].frame}#1 / {body[9].frame}#9"
     for q, v in states(panda, 10):
         a = np.ones(model.nv)
         dyn = model.evaluate(q, v)
@@ -312,7 +312,7 @@ def test_a_domain_tighter_than_the_limits_gives_rows(two_link):
 
 
 SRDF = """<robot name="panda">
-  <disable_collisions link1="panda_hand" link2="panda_link3" reason="Never"/>
+  <disable_collisions link1="panda_link7" link2="panda_link3" reason="Never"/>
 </robot>"""
 
 
@@ -325,9 +325,9 @@ def test_self_collision_on_request(tmp_path):
     (tmp_path / "none.yaml").write_text(text + "self_collision: {srdf: missing.srdf}\n")
     everything, some = (load_problem(str(tmp_path / f"{name}.yaml"), "sphere") for name in ("all", "some"))
     links = [{everything.robot.body[i].frame for i in pair} for pair in everything.robot.self_pairs]
-    assert {"panda_hand", "panda_link3"} in links and {"panda_link3", "panda_link4"} not in links
+    assert {"panda_link7", "panda_link3"} in links and {"panda_link3", "panda_link4"} not in links
     kept = [{some.robot.body[i].frame for i in pair} for pair in some.robot.self_pairs]
-    assert {"panda_hand", "panda_link3"} not in kept and 0 < len(kept) < len(links)
+    assert {"panda_link7", "panda_link3"} not in kept and 0 < len(kept) < len(links)
     q = everything.robot.start
     p = everything.safety.points.kinematics(everything.model.evaluate(q, np.zeros(7))).p
     rows = everything.safety.evaluate(everything.model.evaluate(q, np.zeros(7)))
