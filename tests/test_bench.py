@@ -17,9 +17,9 @@ from ppcbf_robots.world import Sphere
 
 
 def test_a_case_is_about_solved_qps(two_link):
-    problem = crowd(load_robot("two_link"), 20)
+    problem = crowd(load_robot("two_link"), 126)
     case = measure(problem, default_barrier(problem), FilterConfig(), 200)
-    assert (case.robot, case.joints, case.pairs, case.steps) == ("two_link", 2, 20, 200)
+    assert (case.robot, case.joints, case.pairs, case.steps) == ("two_link", 2, 126, 200)
     assert 0.0 < case.median_us <= case.p99_us <= case.max_us
     assert tuple(case.stages) == STAGES and min(case.stages.values()) > 0.0
 
@@ -35,7 +35,7 @@ def test_obstacles_out_of_reach_are_refused(two_link):
 
 def test_command(tmp_path):
     picture = tmp_path / "bench.png"
-    arguments = ["bench", "two_link", "--steps", "100", "--pairs", "10", "--figure", str(picture), "--json"]
+    arguments = ["bench", "two_link", "--steps", "100", "--pairs", "126", "--figure", str(picture), "--json"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     cases = json.loads(done.stdout)["cases"]
