@@ -311,7 +311,8 @@ def listening_addresses(port: int) -> set[str]:
 def test_ctrl_c_ends_it_and_stdout_stays_empty(two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
     two_link[1].save(tmp_path / "run.npz")
     program = f"""
-import sys, pathlib
+import signal, sys, pathlib
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit that it is ignored
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.rollout import Trajectory
 from ppcbf_robots.viewer import show
@@ -329,7 +330,10 @@ server.wait()
         assert not children.exists() or children.read_text() == ""
         time.sleep(1.0)  # so that the interrupt comes while the program waits, not just before
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=10)
+        try:
+            out, err = process.communicate(timeout=10)
+        finally:
+            process.kill()  # or leaving the block would wait for ever
     assert (process.returncode, out, err) == (0, b"", b"")
 
 
