@@ -211,7 +211,7 @@ def test_without_gravity_the_same_torque_less_gravity(panda, states, kind):
     config = FilterConfig(kind=kind)
     barrier = panda.barrier("lb-cbf", spec=BarrierSpec())
     both = [SafetyFilter(panda.model, panda.safety, barrier, config, gravity_included=x) for x in (True, False)]
-    for i, (q, v) in enumerate(states(panda, 60)):
+    for i, (q, v) in enumerate(states(panda, 150)):
         dyn = panda.model.evaluate(q, 0.6 * v)
         nominal = panda.robot.controller.evaluate(dyn)
         with_g, without = (f.step(float(i), q, 0.6 * v, nominal.u - x, float(nominal.d_p))
