@@ -112,8 +112,7 @@ class SafetyFilter:
         try:
             obstacles = self.safety.packed.moved(motions) if motions else None
         except InputError as error:
-            offset = 0.0 if self.gravity_included else dyn.g
-            return self._count(StepResult(self._fallback(dyn) - offset, Status.FAULT, str(error), np.nan, np.nan, ""))
+            return self._count(self._fault(dyn, str(error)))
         return self._count(self.filter(t, dyn, u_des, d_p, obstacles))
 
     def filter(
@@ -127,13 +126,12 @@ class SafetyFilter:
         h, phi = float(rows.h.min()), float(rows.phi.min())
         wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
         if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
-            u = self._fallback(dyn) - offset
-            return StepResult(u, Status.FAULT, "u_des, d_p or the barrier is not finite", h, phi, "")
+            return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi)
         pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
         c = self.correction.correct(dyn, rows, u_des + offset, budget, self.robot.u_max)
         if c.status is Status.FAULT:
-            return StepResult(self._fallback(dyn) - offset, c.status, c.reason, h, phi, self._name(c.row))
+            return self._fault(dyn, c.reason, h, phi, self._name(c.row))
         status = c.status
         if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
             status = Status.RESTING
@@ -141,9 +139,10 @@ class SafetyFilter:
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
 
-    def _fallback(self, dyn: Dynamics) -> Array:
-        """``sat(g - K_d v)``: kinetic energy cannot grow under it."""
-        return np.clip(dyn.g - self.damping * dyn.v, -self.robot.u_max, self.robot.u_max)
+    def _fault(self, dyn: Dynamics, reason: str, h: float = np.nan, phi: float = np.nan, row: str = "") -> StepResult:
+        """``sat(g - K_d v)`` for a valid state without a usable answer: kinetic energy cannot grow under it."""
+        u = np.clip(dyn.g - self.damping * dyn.v, -self.robot.u_max, self.robot.u_max)
+        return StepResult(u if self.gravity_included else u - dyn.g, Status.FAULT, reason, h, phi, row)
 
     def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
         """Hardly any speed, now and RESTING_TIME ahead under u."""
