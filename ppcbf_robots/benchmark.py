@@ -125,7 +125,7 @@ def _stages(
         at.append(clock())
         rows = barrier.rows(dyn, safety)
         at.append(clock())
-        runtime.correction.correct(dyn, rows, u_des, d_p, model.u_max)
+        runtime.correction.correct(dyn, safety, rows, u_des, d_p, model.u_max)
         at.append(clock())
         times[i] = 1e-3 * np.diff(at)
     return dict(zip(STAGES, np.median(times, axis=0).tolist(), strict=True))

@@ -19,7 +19,7 @@ from ppcbf_robots.condense import condense, hessian, nearest, pick, verify
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
-from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.specs import Array
 
 Metric = Literal["torque", "kinetic"]
@@ -110,8 +110,8 @@ class QPRows:
 class ClosedForm:
     """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
 
-    def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
-        self.barrier, self.safety, self.config = barrier, safety, config
+    def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
+        self.barrier, self.config = barrier, config
 
     def _active(self, rows: BarrierRows) -> Array:
         spec = self.barrier.spec
@@ -120,14 +120,16 @@ class ClosedForm:
             return np.ones_like(near) if spec.act_within is None else np.asarray(near)
         return np.asarray(near | (rows.phi <= spec.epsilon))  # a state beyond the band must not pass unfiltered
 
-    def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
+    def correct(
+        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array
+    ) -> Correction:
         """The paper's correction; d_p and u_max do not enter it."""
         active = np.flatnonzero(self._active(rows))
         if not active.size:
             return Correction(u_des, Status.FREE, "outside the band", -1)
         k = int(active[np.argmin(rows.phi[active])])
         if self.barrier.kind == "pp-cbf":
-            return self._damp(dyn, k, u_des)
+            return self._damp(dyn, safety, k, u_des)
         Lg = rows.Lg_phi[k]
         psi = float(rows.Lf_phi[k] + Lg @ u_des)
         if psi >= 0.0:
@@ -138,7 +140,7 @@ class ClosedForm:
             return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
         return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
 
-    def _damp(self, dyn: Dynamics, k: int, u_des: Array) -> Correction:
+    def _damp(self, dyn: Dynamics, safety: SafetyRows, k: int, u_des: Array) -> Correction:
         """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one period.
 
         L_g phi = -vᵀ vanishes at rest, where the explicit λ divides by |v|² and chatters (30 N m from tick to tick on
@@ -148,14 +150,13 @@ class ClosedForm:
         dt, spec = self.config.dt, self.barrier.spec
         momentum = dyn.M @ dyn.v + dt * (u_des - dyn.b)
         D = np.eye(len(u_des)) if self.config.metric == "torque" else dyn.M
-        safety = self.safety.evaluate(dyn)
-        grad, h = safety.grad[k], float(safety.h[k])
+        grad, drift, h = safety.grad[k], float(safety.drift[k]), float(safety.h[k])
 
         def damped(multiplier: float) -> tuple[float, Array]:
             """Residual of ``phi̇ >= -gamma_K phi`` and the correction, both at v⁺."""
             v = np.linalg.solve(dyn.M + dt * multiplier * D, momentum)
             correction = -multiplier * (D @ v)
-            phi_dot = spec.alpha_pp * (grad @ v) - v @ (u_des + correction - dyn.g)
+            phi_dot = spec.alpha_pp * (grad @ v + drift) - v @ (u_des + correction - dyn.g)
             phi = spec.alpha_pp * h - 0.5 * v @ dyn.M @ v
             return float(phi_dot + spec.gamma_K * phi), correction
 
@@ -199,8 +200,10 @@ class QPFilter:
         )  # fmt: skip
         return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold
 
-    def correct(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array) -> Correction:
-        """The least correction in the configured metric, checked before it is returned."""
+    def correct(
+        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array
+    ) -> Correction:
+        """The least correction in the configured metric, checked before it is returned; ``rows`` say all of safety."""
         qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max)
         if hold and np.all(np.abs(u_des) <= u_max):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)

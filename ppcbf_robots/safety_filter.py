@@ -64,7 +64,8 @@ class SafetyFilter:
         self.config = config or FilterConfig()
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
-        self.correction = (ClosedForm if self.config.kind == "closed-form" else QPFilter)(barrier, safety, self.config)
+        closed = self.config.kind == "closed-form"
+        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config)
         learned = isinstance(barrier, RhoBarrier)
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
@@ -112,6 +113,7 @@ class SafetyFilter:
         try:
             obstacles = self.safety.packed.moved(motions) if motions else None
         except InputError as error:
+            self._remember(t, dyn)
             return self._count(self._fault(dyn, str(error)))
         return self._count(self.filter(t, dyn, u_des, d_p, obstacles))
 
@@ -119,7 +121,7 @@ class SafetyFilter:
         self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None, obstacles: Packed | None = None
     ) -> StepResult:
         """The step for a state that was already evaluated (and checked), with the obstacles where they are now."""
-        self._last, self._invalid_steps = (t, dyn.g), 0
+        self._remember(t, dyn)
         safety = self.safety.evaluate(dyn, obstacles)
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
         offset = 0.0 if self.gravity_included else dyn.g
@@ -129,7 +131,7 @@ class SafetyFilter:
             return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi)
         pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
-        c = self.correction.correct(dyn, rows, u_des + offset, budget, self.robot.u_max)
+        c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max)
         if c.status is Status.FAULT:
             return self._fault(dyn, c.reason, h, phi, self._name(c.row))
         status = c.status
@@ -138,6 +140,10 @@ class SafetyFilter:
         u = c.u - offset
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
+
+    def _remember(self, t: float, dyn: Dynamics) -> None:
+        """This state is valid: what an invalid one after it is bridged with."""
+        self._last, self._invalid_steps = (t, dyn.g), 0
 
     def _fault(self, dyn: Dynamics, reason: str, h: float = np.nan, phi: float = np.nan, row: str = "") -> StepResult:
         """``sat(g - K_d v)`` for a valid state without a usable answer: kinetic energy cannot grow under it."""

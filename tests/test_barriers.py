@@ -141,14 +141,14 @@ def boundary_states(problem, barrier, states, count):
 def test_kinetic_corrections_dissipate_on_the_boundary(problem, make_barrier, states, name):
     """Passivity by construction: on phi_k = 0, vᵀ w_k <= -gamma h_k <= 0, so every push along w_k takes energy out."""
     barrier, corrected = make_barrier(in_a_band(problem), name), 0
-    closed_form = ClosedForm(barrier, problem.safety, FilterConfig(kind="closed-form", metric="kinetic"))
+    closed_form = ClosedForm(barrier, FilterConfig(kind="closed-form", metric="kinetic"))
     for dyn, k in boundary_states(problem, barrier, states, 15):
         rows = rows_at(problem, barrier, dyn)
         assert rows.phi[k] == pytest.approx(0.0, abs=1e-6)
         assert dyn.v @ rows.w[k] <= -barrier.spec.gamma * rows.h[k] + 1e-6
         one_row = type(rows)(*(x[[k]] for x in vars(rows).values()))
         u_des = dyn.b - 1e3 * rows.Lg_phi[k]  # towards the obstacle
-        answer = closed_form.correct(dyn, one_row, u_des, None, problem.model.u_max)
+        answer = closed_form.correct(dyn, problem.safety.evaluate(dyn), one_row, u_des, None, problem.model.u_max)
         assert dyn.v @ (answer.u - u_des) <= 1e-6
         corrected += answer.status is Status.CORRECTING
     assert corrected >= 3
@@ -159,11 +159,11 @@ def test_the_papers_metric_does_inject_energy_somewhere(problem, make_barrier, s
     if problem.robot.name == "cartpole":
         pytest.skip("needs a body whose contact force is not along one joint")
     barrier, injected = make_barrier(in_a_band(problem), "lb-cbf"), 0
-    closed_form = ClosedForm(barrier, problem.safety, FilterConfig(kind="closed-form", metric="torque"))
+    closed_form = ClosedForm(barrier, FilterConfig(kind="closed-form", metric="torque"))
     for dyn, k in boundary_states(problem, barrier, states, 40):
         rows = rows_at(problem, barrier, dyn)
         one_row = type(rows)(*(x[[k]] for x in vars(rows).values()))
         u_des = dyn.b - 1e3 * rows.Lg_phi[k]
-        answer = closed_form.correct(dyn, one_row, u_des, None, problem.model.u_max)
+        answer = closed_form.correct(dyn, problem.safety.evaluate(dyn), one_row, u_des, None, problem.model.u_max)
         injected += dyn.v @ (answer.u - u_des) > 1e-6
     assert injected > 0

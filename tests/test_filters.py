@@ -27,7 +27,8 @@ METRICS = ["torque", "kinetic"]
 
 def rows_at(problem, barrier, q, v):
     dyn = problem.model.evaluate(q, v)
-    return dyn, barrier.rows(dyn, problem.safety.evaluate(dyn))
+    safety = problem.safety.evaluate(dyn)
+    return dyn, safety, barrier.rows(dyn, safety)
 
 
 def qp_slack(barrier, rows, u, config):
@@ -48,12 +49,12 @@ def weight(dyn, metric):
 def test_closed_form_brings_psi_to_zero(problem, states, make_barrier, metric):
     """Eq. (13): psi(u) = 0 on the corrected row, along L_g phi or w, and nothing where psi(u_des) >= 0."""
     barrier, model = make_barrier(problem, "pp-ncbf-convex"), problem.model
-    closed_form = ClosedForm(barrier, problem.safety, FilterConfig(kind="closed-form", metric=metric))
+    closed_form = ClosedForm(barrier, FilterConfig(kind="closed-form", metric=metric))
     rng, seen = np.random.default_rng(0), dict.fromkeys(Status, 0)
     for q, v in states(problem, 300):
-        dyn, rows = rows_at(problem, barrier, q, v)
+        dyn, safety, rows = rows_at(problem, barrier, q, v)
         u_des = rng.uniform(-1.0, 1.0, model.nv) * model.u_max
-        answer = closed_form.correct(dyn, rows, u_des, None, model.u_max)
+        answer = closed_form.correct(dyn, safety, rows, u_des, None, model.u_max)
         seen[answer.status] += 1
         if answer.status is Status.FREE:
             np.testing.assert_array_equal(answer.u, u_des)
@@ -78,10 +79,10 @@ def test_closed_form_acts_only_in_its_band(cartpole, two_link):
         (two_link, [0.3, 0.4], [0.0, 0.0], False),  # h = 0.071 > 0.05, phi = 0.35
     ):
         barrier = problem.barrier("lb-cbf")
-        dyn, rows = rows_at(problem, barrier, np.array(q), np.array(v))
-        closed_form = ClosedForm(barrier, problem.safety, FilterConfig(kind="closed-form", metric="torque"))
+        dyn, safety, rows = rows_at(problem, barrier, np.array(q), np.array(v))
+        closed_form = ClosedForm(barrier, FilterConfig(kind="closed-form", metric="torque"))
         towards = dyn.b - 1e3 * rows.Lg_phi[0]
-        status = closed_form.correct(dyn, rows, towards, None, problem.model.u_max).status
+        status = closed_form.correct(dyn, safety, rows, towards, None, problem.model.u_max).status
         assert (status is Status.CORRECTING) == acts
 
 
@@ -133,11 +134,11 @@ def test_qp_is_the_least_correction_over_all_rows(problem, states, make_barrier,
     qp_filter, seen = QPFilter(barrier, problem.safety, config), dict.fromkeys(Status, 0)
     v_domain = problem.safety.v_domain
     for q, v in states(problem, 120):
-        dyn, rows = rows_at(problem, barrier, q, 0.5 * v)
+        dyn, safety, rows = rows_at(problem, barrier, q, 0.5 * v)
         if rows.h.min() < 0.0:
             continue
         nominal = problem.robot.controller.evaluate(dyn)
-        answer = qp_filter.correct(dyn, rows, nominal.u, float(nominal.d_p), model.u_max)
+        answer = qp_filter.correct(dyn, safety, rows, nominal.u, float(nominal.d_p), model.u_max)
         expected = reference_qp(dyn, rows, nominal.u, float(nominal.d_p), model.u_max, barrier, config, v_domain)
         status = Status.CORRECTING
         if expected is None:
@@ -207,8 +208,9 @@ def test_one_row_filter_against_the_exact_dual(panda, states, solver):
     qp_filter, rng, seen = QPFilter(barrier, safety, config), np.random.default_rng(1), set()
     for q, v in states(panda, 200):
         dyn = model.evaluate(q, rng.uniform(0.0, 12.0) * v)
-        rows, u_des = barrier.rows(dyn, safety.evaluate(dyn)), rng.uniform(-60.0, 60.0, 7)
-        answer = qp_filter.correct(dyn, rows, u_des, None, model.u_max)
+        h = safety.evaluate(dyn)
+        rows, u_des = barrier.rows(dyn, h), rng.uniform(-60.0, 60.0, 7)
+        answer = qp_filter.correct(dyn, h, rows, u_des, None, model.u_max)
         slack = qp_slack(barrier, rows, u_des, config)[0]
         z = exact_one_row(rows.Lg_phi[0] * 40.0, -slack, -1.0 - u_des / 40.0, 1.0 - u_des / 40.0)
         seen.add(answer.status)
@@ -227,11 +229,12 @@ def test_one_row_in_the_kinetic_metric_pushes_along_w(two_link, states):
     qp_filter = QPFilter(barrier, safety, config)
     for q, v in states(two_link, 300):
         dyn = model.evaluate(q, v)
-        rows = barrier.rows(dyn, safety.evaluate(dyn))
+        h = safety.evaluate(dyn)
+        rows = barrier.rows(dyn, h)
         slack, w = qp_slack(barrier, rows, dyn.b, config)[0], rows.w[0]
         expected = -w * slack / (w @ dyn.Minv @ w)
         if slack < 0.0 and np.all(np.abs(dyn.b + expected) < model.u_max):
-            answer = qp_filter.correct(dyn, rows, dyn.b, None, model.u_max)
+            answer = qp_filter.correct(dyn, h, rows, dyn.b, None, model.u_max)
             np.testing.assert_allclose(answer.u - dyn.b, expected, atol=5e-3)
             corrected += 1
     assert corrected > 10
@@ -248,11 +251,11 @@ def test_promises_hold_on_every_answer(problem, states, barrier_name, make_barri
     config, rng = FilterConfig(metric=metric, solver=solver), np.random.default_rng(2)
     qp_filter = QPFilter(barrier, problem.safety, config)
     for q, v in states(problem, 40):
-        dyn, rows = rows_at(problem, barrier, q, rng.uniform(0.0, 1.5) * v)
+        dyn, safety, rows = rows_at(problem, barrier, q, rng.uniform(0.0, 1.5) * v)
         nominal = problem.robot.controller.evaluate(dyn)
         u_des = nominal.u + rng.normal(0.0, 0.3, model.nv) * model.u_max
         d_p = float(nominal.d_p) if rng.uniform() < 0.7 else None
-        answer = qp_filter.correct(dyn, rows, u_des, d_p, model.u_max)
+        answer = qp_filter.correct(dyn, safety, rows, u_des, d_p, model.u_max)
         if answer.status is Status.FAULT:  # a solver may give up on a hard problem, which SafetyFilter answers
             continue
         assert np.all(np.abs(answer.u) <= model.u_max)
@@ -377,12 +380,13 @@ def test_the_velocity_domain_gives_way_first(panda):
     barrier = panda.barrier("lb-cbf")
     v = np.zeros(7)
     v[0] = 2.0 * panda.robot.domain.v[0, 1]
-    dyn, rows = rows_at(panda, barrier, panda.robot.start, -v)
+    dyn, safety, rows = rows_at(panda, barrier, panda.robot.start, -v)
     nominal = panda.robot.controller.evaluate(dyn)
-    answer = QPFilter(barrier, panda.safety, config).correct(dyn, rows, nominal.u, float(nominal.d_p), model.u_max)
+    qp_filter, d_p = QPFilter(barrier, panda.safety, config), float(nominal.d_p)
+    answer = qp_filter.correct(dyn, safety, rows, nominal.u, d_p, model.u_max)
     assert answer.status is Status.CORRECTING and answer.reason.endswith("the velocity domain given up")
     assert np.all(np.abs(answer.u) <= model.u_max)
-    assert -v @ (answer.u - nominal.u) <= float(nominal.d_p) + 1e-6
+    assert -v @ (answer.u - nominal.u) <= d_p + 1e-6
     assert qp_slack(barrier, rows, answer.u, config).min() >= -1e-3
 
 

@@ -198,12 +198,13 @@ def test_closed_form_critics_are_the_runtime_filters_excess(on_band, network, me
         rows, v, rays.u_rest - kd * v, (kd * v * v).sum(-1), torch.as_tensor(u_max), metric, 0.0, p_ref
     )
     barrier = problem.barrier("pp-ncbf", network)
-    filter_ = ClosedForm(barrier, problem.safety, FilterConfig("closed-form", metric))
+    filter_ = ClosedForm(barrier, FilterConfig("closed-form", metric))
     expected = []
     for qi, vi in zip(rays.q.numpy(), v.numpy(), strict=True):
         dyn = robot.evaluate(qi, vi)
         nominal = problem.robot.controller.evaluate(dyn)
-        c = filter_.correct(dyn, barrier.rows(dyn, problem.safety.evaluate(dyn)), nominal.u, None, u_max)
+        safety = problem.safety.evaluate(dyn)
+        c = filter_.correct(dyn, safety, barrier.rows(dyn, safety), nominal.u, None, u_max)
         acts = c.status is not Status.FREE
         excess = max(0.0, float(np.max(np.abs(c.u) / u_max)) - 1.0), max(0.0, vi @ (c.u - nominal.u) - nominal.d_p)
         expected.append((acts * excess[0], acts * excess[1] / p_ref))

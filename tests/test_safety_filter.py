@@ -15,7 +15,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.qp import make_solver
 from ppcbf_robots.rollout import simulate
-from ppcbf_robots.safety_filter import SafetyFilter
+from ppcbf_robots.safety_filter import SafetyFilter, StepResult
 from ppcbf_robots.shapes import Motion
 from ppcbf_robots.specs import BarrierSpec
 
@@ -332,6 +332,48 @@ def test_learned_terms_are_left_out_while_an_obstacle_moves(panda, make_barrier)
     u = panda.model.gravity(panda.robot.start)
     args = 0.0, panda.robot.start, v, u, None, {"ball": Motion(xyz=np.array([0.5, 0.1, 0.5]))}
     np.testing.assert_allclose(learned.step(*args).u, blind.step(*args).u)
+
+
+@pytest.mark.parametrize("metric", ["torque", "kinetic"])
+def test_the_energy_barriers_damper_is_told_of_a_moving_obstacle(two_link, metric):
+    """At the velocity v⁺ that the period ends with, ``phi̇ = -gamma_K phi`` for the circle where it is, as it moves."""
+    model, barrier = two_link.model, two_link.barrier("pp-cbf")
+    config = FilterConfig(kind="closed-form", metric=metric)
+    q, v = two_link.robot.start, np.array([-0.3, -0.3])
+    dyn = model.evaluate(q, v)
+    tip = two_link.safety.points.kinematics(dyn).p[-1]
+    velocity = np.array([-0.02, 0.01, 0.0])
+
+    def h(t: float, center: np.ndarray) -> tuple[float, np.ndarray]:
+        """Distance and gradient with the circle t [s] ahead."""
+        rows = two_link.safety.evaluate(dyn, two_link.safety.packed.moved({"circle": Motion(center + t * velocity)}))
+        return rows.h[0], rows.grad[0]
+
+    def step(center: np.ndarray) -> StepResult:
+        filter_ = SafetyFilter(model, two_link.safety, barrier, config)
+        return filter_.step(0.0, q, v, dyn.g, 0.0, {"circle": Motion(center, velocity=velocity)})
+
+    near = tip + np.array([0.24, 0.0, 0.0])
+    u = step(near).u
+    assert step(tip + np.array([2.0, 0.0, 0.0])).status is Status.FREE
+    distance, grad = h(0.0, near)
+    h_t = (h(1e-6, near)[0] - h(-1e-6, near)[0]) / 2e-6
+    after = v + config.dt * dyn.Minv @ (u - dyn.b)
+    spec = barrier.spec
+    phi_dot = spec.alpha_pp * (grad @ after + h_t) - after @ (u - dyn.g)
+    phi = spec.alpha_pp * distance - 0.5 * after @ dyn.M @ after
+    assert not np.allclose(u, dyn.g)
+    assert phi_dot + spec.gamma_K * phi == pytest.approx(0.0, abs=1e-2 * spec.alpha_pp * abs(h_t))
+
+
+def test_a_state_with_a_bad_motion_still_counts_as_valid(two_link):
+    """The state was good: an invalid one after it is bridged with its gravity, not answered by STOP."""
+    filter_ = SafetyFilter(two_link.model, two_link.safety, two_link.barrier("lb-cbf"))
+    q, g = two_link.robot.start, two_link.model.gravity(two_link.robot.start)
+    assert filter_.step(1.0, q, np.zeros(2), g, 0.0, {"cat": Motion()}).status is Status.FAULT
+    bridged = filter_.step(1.001, [np.nan, 0.0], np.zeros(2), g, 0.0)
+    assert bridged.status is Status.INVALID
+    np.testing.assert_allclose(bridged.u, g)
 
 
 # ---------------------------------------------------------------------------------------------- the domain X
