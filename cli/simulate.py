@@ -11,7 +11,7 @@ from rich.progress import track
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, yes
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from ppcbf_robots.engines import Engine, EngineName
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
@@ -173,9 +173,8 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
     out.print(
         f"energy             rises by {facts['energy_rise']:.2g} of V0, {facts['injected']:.3g} J injected in all"
     )
-    out.print(f"goal reached       {yes(facts['reached_goal'])}  (largest joint error {number(facts['goal_error'])})")
-    if facts["rests_on"]:
-        out.print(f"rests on           {facts['rests_on']}: a passive filter cannot climb over it")
+    if (end := trajectory.ending()) is not None:
+        out.print(f"end                {end.text()}")
     if meta["contacts"] is not None:
         _print_contacts(meta["contacts"], len(trajectory.t))
     out.print("filter             " + ", ".join(f"{k} {n}" for k, n in facts["filter_counts"].items()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import zipfile
 import zlib
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ppcbf_robots.controllers import NominalController
+from ppcbf_robots.ending import GOAL_TOLERANCE, Ending, judge
 from ppcbf_robots.engines import ContactLog, Engine, PinocchioEngine
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import Status
@@ -22,7 +24,6 @@ from ppcbf_robots.safety_filter import SafetyFilter, StepResult
 from ppcbf_robots.specs import Array
 
 RK4_STEP = 5e-4  # [s], the paper's T_s
-GOAL_TOLERANCE = 0.05  # [rad | m]
 NEAR = 0.05  # [m], clearance below which an arm counts as passing an obstacle
 V_FLOOR = 0.01  # [J], least storage that energy rises are compared with
 
@@ -66,7 +67,7 @@ class Trajectory:
             raise InputError(f"trajectory not found: {path}") from None
         except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
             raise InputError(f"{path}: not a trajectory of `ppcbf simulate`") from None
-        fits = isinstance(meta, dict) and {"goal", "rests_on"} <= meta.keys()
+        fits = isinstance(meta, dict) and "goal" in meta
         if not fits or len({x.shape[:1] for x in data.values()}) != 1:
             raise InputError(f"{path}: not a trajectory of `ppcbf simulate` (its fields do not belong together)")
         return Trajectory(**data, meta=meta)
@@ -77,6 +78,7 @@ class Trajectory:
         rise = float(np.max(self.V - np.minimum.accumulate(self.V)))
         goal = np.asarray(self.meta["goal"])
         error = float(np.max(np.abs(model.difference(self.q[-1], goal))))
+        end = self.ending()
         contacts = self.meta.get("contacts")  # absent in files of version 0.1.0
         return {
             "min_h": float(self.h.min()),
@@ -86,12 +88,18 @@ class Trajectory:
             "injected": float(np.maximum(np.diff(self.V), 0.0).sum()),
             "reached_goal": error < GOAL_TOLERANCE,
             "goal_error": error,
+            "end": None if end is None else dataclasses.asdict(end) | {"remaining": end.remaining},
             "cleared_at": self._cleared_at(),
-            "rests_on": self.meta["rests_on"],
+            "rests_on": next(iter(end.held_by)) if end is not None and end.state == "held" else None,
             "contacts": None if contacts is None else contacts["steps"],
             "contact_with": None if contacts is None else [f"{c['link']} / {c['obstacle']}" for c in contacts["pairs"]],
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
+
+    def ending(self) -> Ending | None:
+        """How the run ended; None if it diverged, or in files of version 0.2.0."""
+        end = self.meta.get("end")
+        return None if end is None else Ending(**end)
 
     def _cleared_at(self) -> float | None:
         """Time [s] after which the clearance stays above 5 cm; None if it never fell below, or never rose again."""
@@ -136,7 +144,8 @@ def simulate(
     for i in range(steps + 1):
         t = i * substeps * RK4_STEP
         q, v = engine.state()
-        touched.add(t, engine.contacts())
+        touching = engine.contacts()
+        touched.add(t, touching)
         dyn = model.evaluate(q, v)
         nominal = controller.evaluate(dyn)
         rows = safety.evaluate(dyn)
@@ -154,8 +163,11 @@ def simulate(
             on_step(t)
     names = [f for f in Trajectory.__dataclass_fields__ if f != "meta"]
     fields: dict[str, Any] = {k: np.array(x) for k, x in zip(names, zip(*record, strict=True), strict=True)}
-    moving = np.abs(fields["v"][-1]) > 0.02 * model.v_max
-    rests = last.row if last.status not in (Status.FREE, Status.STOP) and not np.any(moving) else ""
-    extra = {"goal": controller.goal.tolist(), "rests_on": rests or None, "complete": len(record) == steps + 1,
-             "engine": engine.name, "contacts": touched.report()}  # fmt: skip
-    return Trajectory(**fields, meta={**(meta or {}), **extra})
+    complete = len(record) == steps + 1
+    extra = {"goal": controller.goal.tolist(), "complete": complete, "engine": engine.name,
+             "contacts": touched.report()}  # fmt: skip
+    run = Trajectory(**fields, meta={**(meta or {}), **extra})
+    deciding = last.row if last.status not in (Status.FREE, Status.STOP) else ""
+    touches = [f"{c.link} / {c.obstacle}" for c in touching or ()]
+    run.meta["end"] = dataclasses.asdict(judge(run, safety, deciding, touches)) if complete else None
+    return run

@@ -243,7 +243,7 @@ def test_simulate_a_trained_barrier(trajectory, barrier):
     np.testing.assert_array_equal(data["active"], data["status"] > 0)
     meta = json.loads(str(data["meta"]))
     assert meta.items() >= {"robot": "two_link", "obstacles": "circle", "barrier": str(barrier), "filter": "qp",
-                            "barrier_kind": "pp-ncbf", "metric": "kinetic", "goal": [1.0, 1.2], "rests_on": None,
+                            "barrier_kind": "pp-ncbf", "metric": "kinetic", "goal": [1.0, 1.2],
                             "complete": True}.items()  # fmt: skip
 
 
@@ -251,7 +251,7 @@ def test_simulate_reports_what_the_trajectory_holds(tmp_path, two_link):
     path = tmp_path / "new" / "t.npz"
     found = facts("simulate", "two_link", "circle", "--duration", 0.1, "--rate", 200, "--out", path)
     assert set(found) == {"min_h", "clearance", "max_torque_ratio", "energy_rise", "injected", "reached_goal",
-                          "goal_error", "cleared_at", "rests_on", "contacts", "contact_with", "filter_counts",
+                          "goal_error", "cleared_at", "rests_on", "end", "contacts", "contact_with", "filter_counts",
                           "outside_domain", "out"}  # fmt: skip
     with np.load(path) as file:
         assert len(file["t"]) == sum(found["filter_counts"].values()) == 21
@@ -316,20 +316,25 @@ def test_continuous_joints_are_given_as_angles(tmp_path, kinova):
     assert (len(q), len(v), len(goal)) == (kinova.model.nq, 6, kinova.model.nq)
 
 
-def test_a_goal_that_is_reached_and_one_behind_an_obstacle():
-    command = ("simulate", "cartpole", "wall", "--start", "1.49,0", "--duration", 0.1)
-    found = facts(*command, "--goal", "1.49,0")
-    assert (found["reached_goal"], found["rests_on"]) == (True, None)
-    found = facts(*command, "--goal", "2,0")
-    assert (found["reached_goal"], found["rests_on"]) == (False, "cart#0 / wall")
-    done = run_cli(*command, "--goal", "2,0")
-    assert "rests on           cart#0 / wall: a passive filter cannot climb over it" in done.stdout
+def test_how_a_run_ends_is_stated():
+    """At the goal at once, under way, and at rest where the spring points straight into the circle."""
+    command = ("simulate", "two_link", "circle", "--start", "0.3,0.6", "--goal")
+    found = facts(*command, "0.3,0.6", "--duration", 0.1)
+    assert (found["reached_goal"], found["rests_on"], found["end"]["state"]) == (True, None, "goal")
+    found = facts(*command, "1.0,1.2", "--duration", 0.5)
+    assert (found["reached_goal"], found["rests_on"], found["end"]["state"]) == (False, None, "moving")
+    assert found["end"]["power"] > 0.0
+    found = facts(*command, "0.53,0.677", "--duration", 15.0)
+    assert (found["reached_goal"], found["rests_on"]) == (False, "tip#0 / circle")
+    assert found["end"]["held_by"].keys() == {"tip#0 / circle"} and found["end"]["constrained_minimum"]
+    done = run_cli(*command, "0.3,0.6", "--duration", 0.1)
+    assert "\nend                goal reached at 0.00 s (largest joint error " in done.stdout
 
 
 def test_a_simulation_that_diverges_exits_3_and_still_prints_json():
     found = facts("simulate", "two_link", "circle", "--barrier", "none", "--velocity", "1e9,1e9", "--duration", 0.01,
                   code=3)  # fmt: skip
-    assert found["reached_goal"] is False
+    assert found["reached_goal"] is False and found["end"] is None
 
 
 def test_view_writes_one_file(trajectory, tmp_path):
