@@ -182,10 +182,11 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
 
 
 def _print_contacts(contacts: dict[str, Any], steps: int) -> None:
-    if not contacts["steps"]:
-        out.print("contact            none")
-        return
-    out.print(f"CONTACT            in {contacts['steps']} of {steps} steps")
+    out.print(f"CONTACT            in {contacts['steps']} of {steps} steps" if contacts["steps"]
+              else "contact            none")  # fmt: skip
+    if contacts["hull_steps"]:
+        out.print(f"                   in {contacts['hull_steps']} more steps only a mesh's convex hull touches")
     for c in contacts["pairs"]:
         pair, depth = f"{c['link']} / {c['obstacle']}", 1e3 * c["depth"]
-        out.print(f"                   {pair} from {c['first']:.3f} s, {depth:.2g} mm deep")
+        hull = ", the hull alone" if c["hull_only"] else ""
+        out.print(f"                   {pair} from {c['first']:.3f} s, {depth:.2g} mm deep{hull}")

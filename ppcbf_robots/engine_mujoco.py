@@ -3,6 +3,7 @@
 The robot is built from Pinocchio's reduced model, joint by joint, not from the URDF: locked joints, payloads and merged
 links are then the same by construction. Joints have neither limits, damping nor friction. Each link has the shapes of
 its collision geometry, meshes as their convex hulls; links without readable geometry have the robot's body spheres.
+Where a hull touches, the mesh itself is looked at, and the contact says whether it is the hull's alone.
 Robot and obstacles touch; the robot's links pass through each other, and what is fixed to the base touches nothing.
 """
 
@@ -18,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.engines import Contact, EngineName
+from ppcbf_robots.mesh_contact import MeshContact
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, BodySphere
@@ -49,6 +51,7 @@ class _Placed(NamedTuple):
     shape: _Shape
     rotation: Array  # (3, 3)
     xyz: Array  # (3,) [m]
+    mesh: coal.BVHModelBase | None = None  # in the shape's frame, whose hull the shape is
 
 
 class MujocoEngine:
@@ -65,15 +68,16 @@ class MujocoEngine:
         _set_options(spec, self.robot)
         links = _add_links(spec, self.robot)
         parts = _robot_parts(self.robot, problem.robot.body)
-        geoms = [(_add_geom(spec, links[joint], p, robot=True), p.label) for joint, p in parts]
-        geoms += [(_add_geom(spec, spec.worldbody, p, robot=False), p.label) for p in _obstacles(problem)]
+        geoms = [(_add_geom(spec, links[joint], p, robot=True), p) for joint, p in parts]
+        geoms += [(_add_geom(spec, spec.worldbody, p, robot=False), p) for p in _obstacles(problem)]
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._set_inertias()
         joints = [self.model.joint(_name(i)) for i in range(1, len(links))]
         self.dofs = np.array([int(j.dofadr[0]) for j in joints])
         self._qpos = np.array([int(j.qposadr[0]) for j in joints])
-        self._labels = {self.model.geom(name).id: label for name, label in geoms}
+        self._placed = {self.model.geom(name).id: part for name, part in geoms}
+        self._mesh_contact = MeshContact(problem.world.obstacles)
 
     def _set_inertias(self) -> None:
         """Masses and inertias, past the compiler, which refuses point masses and links without mass."""
@@ -103,11 +107,21 @@ class MujocoEngine:
         """What touches in the present state, the deepest point of each pair of link and obstacle."""
         mujoco.mj_fwdPosition(self.model, self.data)
         deepest: dict[tuple[str, str], float] = {}
+        real: dict[tuple[str, str], bool] = {}  # not of convex hulls alone
         for pair, distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
             obstacle, part = sorted(pair, key=lambda geom: int(self.model.geom_bodyid[geom]))  # obstacles: body 0
-            key = self._labels[int(part)], self._labels[int(obstacle)]
+            key = self._placed[int(part)].label, self._placed[int(obstacle)].label
             deepest[key] = max(deepest.get(key, 0.0), -float(distance))
-        return [Contact(link, obstacle, depth) for (link, obstacle), depth in deepest.items()]
+            real[key] = real.get(key, False) or self._touches(int(part), key[1])
+        return [Contact(*key, depth, not real[key]) for key, depth in deepest.items()]
+
+    def _touches(self, geom: int, obstacle: str) -> bool:
+        """Whether a shape of the robot that MuJoCo has in contact with an obstacle really is."""
+        part, body = self._placed[geom], self.model.geom_bodyid[geom]
+        if part.mesh is None:
+            return True
+        turn, origin = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
+        return self._mesh_contact.touches(part.mesh, turn @ part.rotation, origin + turn @ part.xyz, obstacle)
 
     def mass_and_bias(self, q: Array, v: Array) -> tuple[Array, Array]:
         """MuJoCo's mass matrix M (nv, nv) and bias torque C v + g (nv,) at (q, v), which becomes the state."""
@@ -191,7 +205,9 @@ def _robot_parts(robot: RobotModel, body: list[BodySphere]) -> Iterator[tuple[in
     objects = _collision_objects(robot)
     for o in objects:
         link = robot.model.frames[o.parentFrame].name
-        yield o.parentJoint, _Placed(link, _link_shape(o.geometry), o.placement.rotation, o.placement.translation)
+        mesh = o.geometry if isinstance(o.geometry, coal.BVHModelBase) else None
+        T = o.placement
+        yield o.parentJoint, _Placed(link, _link_shape(o.geometry), T.rotation, T.translation, mesh)
     covered = {o.parentJoint for o in objects}
     points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
     for sphere, joint, offset in zip(body, points.joints, points.offsets, strict=True):

@@ -25,6 +25,7 @@ class Contact:
     link: str
     obstacle: str
     depth: float  # [m], penetration
+    hull_only: bool = False  # the convex hull of the link's mesh touches, the mesh does not
 
 
 class Engine(Protocol):
@@ -77,21 +78,28 @@ class ContactLog:
 
     def __init__(self) -> None:
         self._known = False
-        self._steps = 0
+        self._steps = self._hull_steps = 0
         self._pairs: dict[tuple[str, str], dict[str, Any]] = {}  # in the order of first contact
 
     def add(self, t: float, contacts: Sequence[Contact] | None) -> None:
         """Contacts of the state at the control step of time t [s]."""
         self._known = contacts is not None
-        self._steps += bool(contacts)
+        real = any(not c.hull_only for c in contacts or ())
+        self._steps += real
+        self._hull_steps += bool(contacts) and not real
         for c in contacts or ():
-            new = {"link": c.link, "obstacle": c.obstacle, "first": t, "depth": c.depth}
+            new = {"link": c.link, "obstacle": c.obstacle, "first": t, "depth": c.depth, "hull_only": True}
             pair = self._pairs.setdefault((c.link, c.obstacle), new)
             pair["depth"] = max(pair["depth"], c.depth)
+            pair["hull_only"] = pair["hull_only"] and c.hull_only
 
     def report(self) -> dict[str, Any] | None:
-        """Control steps in contact and, per pair, first time [s] and largest penetration [m]; None if unknown."""
-        return {"steps": self._steps, "pairs": list(self._pairs.values())} if self._known else None
+        """Control steps in contact, those where only hulls touch, and the pairs; None if unknown.
+
+        A pair has first time [s], largest penetration [m] and whether only the link's hull ever touched.
+        """
+        pairs = list(self._pairs.values())
+        return {"steps": self._steps, "hull_steps": self._hull_steps, "pairs": pairs} if self._known else None
 
 
 def _rk4(model: RobotModel, q: Array, v: Array, u: Array, dt: float) -> tuple[Array, Array]:

@@ -92,7 +92,10 @@ class Trajectory:
             "cleared_at": self._cleared_at(),
             "rests_on": next(iter(end.held_by)) if end is not None and end.state == "held" else None,
             "contacts": None if contacts is None else contacts["steps"],
-            "contact_with": None if contacts is None else [f"{c['link']} / {c['obstacle']}" for c in contacts["pairs"]],
+            "hull_contacts": None if contacts is None else contacts.get("hull_steps", 0),  # 0.2.0 did not tell
+            "contact_with": None
+            if contacts is None
+            else [f"{c['link']} / {c['obstacle']}" for c in contacts["pairs"] if not c.get("hull_only", False)],
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
 

@@ -246,6 +246,38 @@ def test_shapes_of_links(kind, toy, tmp_path):
     assert contacts_at(problem, 0.0, FAR | {"center": [reach + 0.101, 0.0, 0.0]}) == []
 
 
+THINGS = {
+    "sphere": FAR | {"center": [0.0, 0.0, 0.0], "radius": 0.02},
+    "box": {"type": "box", "size": [0.04, 0.04, 0.04]},
+    "capsule": {"type": "capsule", "radius": 0.02, "length": 0.01},
+    "cylinder": {"type": "cylinder", "radius": 0.02, "length": 0.04},
+    "mesh": {"type": "mesh", "scale": 0.02, "vertices": [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]},
+}
+
+
+@pytest.mark.parametrize("kind", THINGS)
+def test_a_hull_that_touches_is_told_from_its_mesh(kind, toy, tmp_path):
+    """Two tetrahedra 0.3 m apart are one mesh: its hull is solid in between, the mesh is not."""
+    second = WEDGE.replace("v 0 ", "v 0.3 ").replace("v 0.05 ", "v 0.35 ").replace("v -0.05 ", "v 0.25 ")
+    triangles = ((1, 2, 3), (1, 3, 4), (1, 4, 2), (2, 4, 3))
+    faces = "".join(f"f {a + k} {b + k} {c + k}\n" for k in (0, 4) for a, b, c in triangles)
+    vertices = [line for line in (WEDGE + second).splitlines() if line.startswith("v")]
+    (tmp_path / "pair.obj").write_text("\n".join(vertices) + "\n" + faces)
+    problem = toy(f'<collision><geometry><mesh filename="{tmp_path}/pair.obj"/></geometry></collision>')
+    place = "center" if kind == "sphere" else "xyz"
+    for x, angle, hull_only in ((0.15, 0.0, True), (0.3, 0.0, False), (0.15, np.pi / 2, True), (0.3, np.pi / 2, False)):
+        at = [x * np.cos(angle), x * np.sin(angle), -0.02]
+        (contact,) = contacts_at(problem, angle, {"name": "thing"} | THINGS[kind] | {place: at})
+        assert contact.hull_only is hull_only
+
+
+def test_a_half_space_meets_the_mesh_where_it_meets_the_hull(toy, tmp_path):
+    (tmp_path / "wedge.obj").write_text(WEDGE)
+    problem = toy(f'<collision><geometry><mesh filename="{tmp_path}/wedge.obj"/></geometry></collision>')
+    floor = {"name": "floor", "type": "half_space", "normal": [0.0, 0.0, 1.0], "offset": -0.049}
+    assert [c.hull_only for c in contacts_at(problem, 0.3, floor)] == [False]
+
+
 def test_links_pass_through_each_other(panda):
     """Folded up, the Panda's hand is inside its shoulder."""
     engine, model = MujocoEngine(in_world(panda, FAR)), panda.model
@@ -275,11 +307,14 @@ def test_the_log_keeps_first_time_and_largest_depth():
     log = ContactLog()
     assert log.report() is None
     hand, arm = Contact("hand", "ball", 0.001), Contact("arm", "ball", 0.002)
-    for t, contacts in ((0.1, []), (0.2, [hand]), (0.3, [arm, Contact("hand", "ball", 0.004)]), (0.4, [hand])):
+    hull = Contact("arm", "ball", 0.002, hull_only=True)
+    for t, contacts in ((0.1, [hull]), (0.2, [hand]), (0.3, [hull, Contact("hand", "ball", 0.004)]), (0.4, [hand])):
         log.add(t, contacts)
-    pairs = [{"link": "hand", "obstacle": "ball", "first": 0.2, "depth": 0.004},
-             {"link": "arm", "obstacle": "ball", "first": 0.3, "depth": 0.002}]  # fmt: skip
-    assert log.report() == {"steps": 3, "pairs": pairs}
+    pairs = [{"link": "arm", "obstacle": "ball", "first": 0.1, "depth": 0.002, "hull_only": True},
+             {"link": "hand", "obstacle": "ball", "first": 0.2, "depth": 0.004, "hull_only": False}]  # fmt: skip
+    assert log.report() == {"steps": 3, "hull_steps": 1, "pairs": pairs}
+    log.add(0.5, [arm])
+    assert log.report()["pairs"][0]["hull_only"] is False
 
 
 # --------------------------------------------------------------------------------------------------- closed loop
@@ -291,7 +326,7 @@ def test_the_panda_touches_a_ball_only_without_the_filter(load):
     assert passed.active.sum() > 500
     assert passed.clearance.min() > 0.0
     assert passed.summary(problem.model)["cleared_at"] < 2.9
-    assert passed.meta["contacts"] == {"steps": 0, "pairs": []}
+    assert passed.meta["contacts"] == {"steps": 0, "hull_steps": 0, "pairs": []}
     assert hit.meta["contacts"]["steps"] > 300
     (pair,) = hit.meta["contacts"]["pairs"]
     assert (pair["link"], pair["obstacle"]) == ("panda_link5", "ball")
@@ -308,7 +343,7 @@ def test_the_panda_passes_a_box_with_the_filter(load):
     problem = load("panda", BOX)
     passed = run(problem, 3.0, filtered=True)
     assert passed.active.sum() > 500
-    assert passed.meta["contacts"] == {"steps": 0, "pairs": []}
+    assert passed.meta["contacts"] == {"steps": 0, "hull_steps": 0, "pairs": []}
 
 
 # ---------------------------------------------------------------------------------------------------------- command
@@ -324,6 +359,7 @@ def test_simulate_reports_contacts(tmp_path):
     assert text.exit_code == 0
     assert facts["contacts"] == contacts["steps"] > 0
     assert facts["contact_with"] == ["panda_link5 / ball"]
+    assert facts["hull_contacts"] < 5  # at first touch only
     assert "engine mujoco" in text.stdout
     assert f"CONTACT            in {contacts['steps']} of 501 steps" in text.stdout
     assert f"panda_link5 / ball from {contacts['pairs'][0]['first']:.3f} s" in text.stdout

@@ -108,7 +108,7 @@ def case(arm: str, world: str, folder: Path, time_limit: float) -> dict[str, Any
         if end is None or end.state != "moving":
             break
     trajectory.save(folder / "run.npz")
-    keep = ("clearance", "contacts", "max_torque_ratio", "energy_rise", "end")
+    keep = ("clearance", "contacts", "hull_contacts", "max_torque_ratio", "energy_rise", "end")
     summary = trajectory.summary(problem.model)
     times = measure(problem, barrier, config, 1000)
     return facts | {k: summary[k] for k in keep} | {
@@ -143,7 +143,8 @@ def table(path: Path) -> None:
         if "note" in c:
             print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {c['note']} | | | | | | | |")
             continue
-        print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {1e3 * c['clearance']:.1f} | {c['contacts']} "
+        hull = f" (hull: {c['hull_contacts']})" if c["hull_contacts"] else ""
+        print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {1e3 * c['clearance']:.1f} | {c['contacts']}{hull} "
               f"| {c['max_torque_ratio']:.2f} | {c['energy_rise']:.0e} | {goal_column(c)} | {c['train_s']:.0f} "
               f"| {c['violations']} of {c['samples']} | {c['filter_us']:.0f} |")  # fmt: skip
 
