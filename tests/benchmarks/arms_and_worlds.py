@@ -67,26 +67,26 @@ def fitted_world(robot: Robot, world: str, folder: Path) -> Path:
     return path
 
 
-def clearance(problem: Problem, angles: Array) -> tuple[float, float, float]:
+def clearance(problem: Problem, q: Array) -> tuple[float, float, float]:
     """Least distance to an obstacle, least h of all rows, and y of the tip against the first joint [m]."""
     model = problem.model
-    dyn = model.evaluate(model.from_angles(angles), np.zeros(model.nv))
+    dyn = model.evaluate(q, np.zeros(model.nv))
     h = problem.safety.evaluate(dyn).h
     tip = problem.safety.points.kinematics(dyn).p[-1]
     return float(h[: problem.safety.pairs].min()), float(h.min()), float(tip[1] - dyn.placements[1, 1, 3])
 
 
 def draw_task(problem: Problem, rng: np.random.Generator, tries: int = 4000) -> tuple[Array, Array] | None:
-    """Start and goal angles on opposite sides, or None if no straight path between such meets an obstacle."""
-    domain, side = problem.robot.domain, 0.15 * reach(problem.robot)
+    """Start and goal (nq,) on opposite sides, or None if no straight path between such meets an obstacle."""
+    model, domain, side = problem.model, problem.robot.domain, 0.15 * reach(problem.robot)
     left, right = [], []
-    for angles in domain.sample_q(rng, tries):
-        distance, least, y = clearance(problem, angles)
+    for q in model.from_angles(domain.sample_q(rng, tries)):
+        distance, least, y = clearance(problem, q)
         if distance >= 0.02 and least > 0.0 and abs(y) > side:
-            (left if y > 0 else right).append(angles)
+            (left if y > 0 else right).append(q)
     for start, goal in zip(left, right, strict=False):
-        path = start + np.linspace(0.0, 1.0, 31)[:, None] * (goal - start)
-        if min(clearance(problem, x)[0] for x in path) <= -0.02:
+        way = model.difference(start, goal)  # continuous joints take the shorter one
+        if min(clearance(problem, model.integrate(start, s * way))[0] for s in np.linspace(0.0, 1.0, 31)) <= -0.02:
             return start, goal
     return None
 
@@ -100,7 +100,7 @@ def case(arm: str, world: str, folder: Path, time_limit: float) -> dict[str, Any
     facts: dict[str, Any] = {"arm": arm, "world": world, "pairs": problem.safety.pairs}
     if task is None:
         return facts | {"note": "no task found"}
-    start, goal = (problem.model.from_angles(x) for x in task)
+    start, goal = task
     problem = problem.with_goal(goal)
     report = train_barrier(problem, "pp-ncbf", "default", 0, folder / "barrier", "cpu", None, time_limit)
     barrier, config = choose_barrier(problem, str(folder / "barrier"), None, None)
