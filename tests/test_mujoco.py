@@ -343,6 +343,7 @@ def test_the_panda_passes_a_box_with_the_filter(load):
     problem = load("panda", BOX)
     passed = run(problem, 3.0, filtered=True)
     assert passed.active.sum() > 500
+    assert passed.h.min() > 0.0
     assert passed.meta["contacts"] == {"steps": 0, "hull_steps": 0, "pairs": []}
 
 
