@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import nnls
 
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.specs import Array
-
-if TYPE_CHECKING:
-    from ppcbf_robots.rollout import Trajectory
 
 GOAL_TOLERANCE = 0.05  # [rad | m]
 WINDOW = 1.0  # [s] at the end of a run, over which rest and progress are judged
@@ -99,17 +96,19 @@ class Ending:
         return text + f"V falls at {self.power:.2g} W: run {self.remaining:.0f} s longer (--duration) at this rate"
 
 
-def judge(run: Trajectory, safety: SafetyFunction, deciding: str, touches: Sequence[str]) -> Ending:
+def judge(
+    run: Mapping[str, Array], goal: Array, safety: SafetyFunction, deciding: str, touches: Sequence[str]
+) -> Ending:
     """How a run ended.
 
     Args:
-        run: its record.
+        run: its record, one row per control step: t, q, v, u, u_des and V as in a trajectory.
+        goal: (nq,).
         safety: the safety function of the run.
         deciding: row that decided the last correction, "" if none.
         touches: contacts of the last state.
     """
-    model, t, q = safety.robot, run.t, run.q
-    goal = np.asarray(run.meta["goal"])
+    model, t, q = safety.robot, run["t"], run["q"]
     errors = np.array([np.abs(model.difference(x, goal)).max() for x in q])
     error = float(errors[-1])
     if error < GOAL_TOLERANCE:
@@ -119,19 +118,19 @@ def judge(run: Trajectory, safety: SafetyFunction, deciding: str, touches: Seque
     span = max(float(t[-1] - t[first]), 1e-9)
     strayed = max(float(np.abs(model.difference(x, q[-1])).max()) for x in q[first:])
     if strayed > STILL * span or len(t) == 1:
-        speeds = np.abs(run.v[first:]).mean(axis=0)
+        speeds = np.abs(run["v"][first:]).mean(axis=0)
         joint = int(speeds.argmax())
         unit = "m" if model.model.joints[joint + 1].shortname().startswith("JointModelP") else "rad"  # prismatic
-        approach, power = (float(x[first] - x[-1]) / span for x in (errors, run.V))
+        approach, power = (float(x[first] - x[-1]) / span for x in (errors, run["V"]))
         along, name, speed = {deciding: None} if deciding else {}, model.joint_names[joint], float(speeds[joint])
         return Ending("moving", error, None, along, touches=touches, fastest=name, unit=unit, speed=speed,
                       approach=approach, power=power)  # fmt: skip
-    delta, u_max = run.u[-1] - run.u_des[-1], model.u_max
+    delta, u_max = run["u"][-1] - run["u_des"][-1], model.u_max
     loads = bearing_rows(safety.evaluate(model.evaluate(q[-1], np.zeros(model.nv))), delta / u_max, u_max)
     if loads:
         named = {safety.names[k]: load for k, load in loads}
         return Ending("held", error, None, named, True, touches=touches)
-    at_limit = [model.joint_names[i] for i in np.flatnonzero(np.abs(run.u[-1]) >= (1.0 - NO_LOAD) * u_max)]
+    at_limit = [model.joint_names[i] for i in np.flatnonzero(np.abs(run["u"][-1]) >= (1.0 - NO_LOAD) * u_max)]
     if deciding and np.abs(delta / u_max).max() > NO_LOAD:
         return Ending("held", error, None, {deciding: None}, at_limit=at_limit, touches=touches)
     return Ending("stalled", error, at_limit=at_limit, touches=touches)

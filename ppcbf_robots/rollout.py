@@ -167,10 +167,9 @@ def simulate(
     names = [f for f in Trajectory.__dataclass_fields__ if f != "meta"]
     fields: dict[str, Any] = {k: np.array(x) for k, x in zip(names, zip(*record, strict=True), strict=True)}
     complete = len(record) == steps + 1
-    extra = {"goal": controller.goal.tolist(), "complete": complete, "engine": engine.name,
-             "contacts": touched.report()}  # fmt: skip
-    run = Trajectory(**fields, meta={**(meta or {}), **extra})
     deciding = last.row if last.status not in (Status.FREE, Status.STOP) else ""
     touches = [f"{c.link} / {c.obstacle}" for c in touching or ()]
-    run.meta["end"] = dataclasses.asdict(judge(run, safety, deciding, touches)) if complete else None
-    return run
+    end = dataclasses.asdict(judge(fields, controller.goal, safety, deciding, touches)) if complete else None
+    extra = {"goal": controller.goal.tolist(), "end": end, "complete": complete, "engine": engine.name,
+             "contacts": touched.report()}  # fmt: skip
+    return Trajectory(**fields, meta={**(meta or {}), **extra})

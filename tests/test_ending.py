@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -12,60 +13,59 @@ from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.ending import Ending, bearing_rows, judge
 from ppcbf_robots.filters import Status
 from ppcbf_robots.problem import Problem
-from ppcbf_robots.rollout import Trajectory, simulate
+from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety_filter import SafetyFilter
 
 T = 2001  # control steps of 1 ms
 GOAL = np.array([1.0, 1.2])
 
 
-def made(problem: Problem, errors: np.ndarray, **changes: np.ndarray) -> Trajectory:
-    """A run of the two-link whose first joint is short of the goal by ``errors`` (T,), the other joint there."""
-    q = GOAL - np.column_stack([errors, np.zeros(T)])
-    fields = {"q": q, "v": np.gradient(q, 1e-3, axis=0), "u": np.zeros((T, 2)), "u_des": np.zeros((T, 2))}
-    others = {f: np.zeros(T) for f in Trajectory.__dataclass_fields__ if f not in ("meta", *fields)}
-    others["t"] = 1e-3 * np.arange(T)
-    return Trajectory(**(others | fields | changes), meta={"goal": GOAL.tolist()})
+def judged(
+    problem: Problem, errors: np.ndarray, row: str = "", touches: Sequence[str] = (), **changes: np.ndarray
+) -> Ending:
+    """The end of a run of the two-link whose first joint is short of the goal by ``errors`` (T,), the other there."""
+    q, zero = GOAL - np.column_stack([errors, np.zeros(T)]), np.zeros((T, 2))
+    run = {"t": 1e-3 * np.arange(T), "q": q, "v": np.gradient(q, 1e-3, axis=0), "u": zero, "u_des": zero}
+    return judge({**run, "V": np.zeros(T), **changes}, GOAL, problem.safety, row, touches)
 
 
 def test_the_goal_counts_from_when_the_arm_stays_there(two_link):
     errors = np.full(T, 0.01)
     errors[:300], errors[500:700] = 0.3, 0.06
-    end = judge(made(two_link, errors), two_link.safety, "tip#0 / circle", [])
+    end = judged(two_link, errors, "tip#0 / circle")
     assert (end.state, end.reached_at) == ("goal", pytest.approx(0.7))
     assert end.text() == "goal reached at 0.70 s (largest joint error 0.01)"
-    assert judge(made(two_link, np.zeros(T)), two_link.safety, "", []).reached_at == 0.0
+    assert judged(two_link, np.zeros(T)).reached_at == 0.0
 
 
 def test_motion_is_told_with_its_direction_and_the_time_left(two_link):
     t = 1e-3 * np.arange(T)
-    end = judge(made(two_link, 0.85 - 0.1 * t, V=3.0 - 0.5 * t), two_link.safety, "", [])
+    end = judged(two_link, 0.85 - 0.1 * t, V=3.0 - 0.5 * t)
     assert (end.state, end.fastest, end.unit) == ("moving", "shoulder", "rad")
     assert (end.speed, end.approach, end.power) == pytest.approx((0.1, 0.1, 0.5))
     assert end.remaining == pytest.approx((0.65 - 0.05) / 0.1)
     assert "towards the goal" in end.text() and end.text().endswith("run 6 s longer (--duration) at this rate")
-    away = judge(made(two_link, 0.65 + 0.1 * t, V=3.0 - 0.5 * t), two_link.safety, "tip#0 / circle", [])
+    away = judged(two_link, 0.65 + 0.1 * t, "tip#0 / circle", V=3.0 - 0.5 * t)
     assert away.remaining is None and "moving along tip#0 / circle, away from the goal" in away.text()
-    swinging = judge(made(two_link, 0.5 + 0.1 * np.sin(20.0 * t)), two_link.safety, "", [])
+    swinging = judged(two_link, 0.5 + 0.1 * np.sin(20.0 * t))
     assert swinging.state == "moving" and "V does not fall" in swinging.text()
 
 
 def test_rest_without_a_row_names_its_cause(two_link):
     errors, u_max = np.full(T, 0.4), two_link.model.u_max
-    weak = made(two_link, errors, u=np.tile([u_max[0], 1.0], (T, 1)), u_des=np.tile([2.0 * u_max[0], 1.0], (T, 1)))
-    end = judge(weak, two_link.safety, "", [])
+    weak = {"u": np.tile([u_max[0], 1.0], (T, 1)), "u_des": np.tile([2.0 * u_max[0], 1.0], (T, 1))}
+    end = judged(two_link, errors, **weak)
     assert (end.state, end.at_limit) == ("stalled", ["shoulder"])
     assert end.text().endswith("no row of the filter holds it: joints at their torque limit: shoulder")
-    touching = judge(made(two_link, errors), two_link.safety, "", ["tip / circle"])
+    touching = judged(two_link, errors, touches=["tip / circle"])
     assert touching.state == "stalled" and touching.text().endswith("in contact: tip / circle")
-    idle = judge(made(two_link, errors), two_link.safety, "", [])
+    idle = judged(two_link, errors)
     assert idle.text().endswith("it is an equilibrium of the controller itself")
 
 
 def test_a_correction_that_no_row_balances_is_no_constrained_minimum(two_link):
     """A damper that holds the arm far from every row, as the PP-CBF's does in the torque metric."""
-    run = made(two_link, np.full(T, 0.4), u_des=np.full((T, 2), 5.0))
-    end = judge(run, two_link.safety, "tip#0 / circle", [])
+    end = judged(two_link, np.full(T, 0.4), "tip#0 / circle", u_des=np.full((T, 2), 5.0))
     assert (end.state, end.constrained_minimum) == ("held", False)
     assert "held by tip#0 / circle, though V has no constrained minimum" in end.text()
 

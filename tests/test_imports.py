@@ -16,10 +16,10 @@ LAYERS = [
     ["specs", "resources", "kernels"],
     ["network_kernel"],
     ["urdf", "urdf_parts", "world", "body", "body_geometry", "body_fit", "body_cache"],
-    ["shapes", "world_shapes", "joints", "meshes"],
+    ["shapes", "world_shapes", "joints", "meshes", "mesh_contact"],
     ["robot", "world_files"],
     ["safety", "controllers", "network", "engines"],
-    ["condense"],
+    ["condense", "ending"],
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["filters"],
     ["safety_filter", "problem"],
@@ -33,7 +33,7 @@ LAYERS = [
 
 OWNERS = {
     "numba": ["kernels"],
-    "scipy": ["shapes", "body_fit"],
+    "scipy": ["shapes", "body_fit", "ending"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
