@@ -34,14 +34,10 @@ class Ending:
     state: State
     goal_error: float  # largest joint error [rad | m]
     reached_at: float | None = None  # [s], since when the goal error is below GOAL_TOLERANCE
-    held_by: Mapping[str, float | None] = field(
-        default_factory=dict
-    )  # rows and their loads λ [N | N m], the largest first
+    held_by: Mapping[str, float | None] = field(default_factory=dict)  # row to load λ [N | N m], the largest first
     constrained_minimum: bool = False  # whether these loads balance the spring
     at_limit: Sequence[str] = field(default_factory=list)  # joints at their torque limit
-    touches: Sequence[str] = field(
-        default_factory=list
-    )  # "link / obstacle" in contact, where the engine knows contacts
+    touches: Sequence[str] = field(default_factory=list)  # "link / obstacle" in contact, if the engine knows any
     fastest: str = ""  # joint
     unit: str = ""  # of that joint, rad or m
     speed: float = 0.0  # its mean over the window [rad/s | m/s]
