@@ -1,8 +1,8 @@
 """A sweep: independent tasks whose results go into one file as they arrive; what is in the file is not run again.
 
-Tasks run in worker processes: on this machine with joblib (loky), or on a Dask cluster. There Dask's own futures are used,
-since joblib's Dask backend keeps finished results on the workers, runs them again when such a worker dies, and waits for
-ever for a task that Dask has given up.
+Tasks run in worker processes: on this machine with joblib (loky), or on a Dask cluster. There Dask's own futures are
+used: joblib's Dask backend leaves finished results on the workers, runs them again when such a worker dies, and waits
+for ever for a task that Dask has given up.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -55,8 +55,8 @@ def run_sweep(
 ) -> list[Record]:
     """Run the tasks whose results are not in the file yet, and return the records of all, in the tasks' order.
 
-    A task that raises, or whose worker dies every time, is recorded with an ``error`` and run again by the next sweep into
-    the same file. An interrupt leaves a file that the next sweep goes on from.
+    A task that raises, or whose worker dies every time, is recorded with an ``error`` and run again by the next sweep
+    into the same file. An interrupt leaves a file that the next sweep goes on from.
 
     Args:
         tasks: with different keys.
@@ -83,8 +83,8 @@ def run_sweep(
     return [done[name] for name in by_name]
 
 
-def _locally(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, Outcome]]:
-    """Outcomes in the order of completion; a dead worker breaks joblib's pool, and a new one takes what is unfinished."""
+def _locally(tasks: Sequence[Task], jobs: int) -> Generator[tuple[Task, Outcome]]:
+    """Outcomes in the order of completion; a dead worker breaks joblib's pool, and a new one takes what is left."""
     waiting = {task.name: task for task in tasks}
     attempts: Counter[str] = Counter()
     while waiting:
@@ -116,7 +116,7 @@ def _leave_interrupts_to_the_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _on_dask(tasks: Sequence[Task], address: str) -> Iterator[tuple[Task, Outcome]]:
+def _on_dask(tasks: Sequence[Task], address: str) -> Generator[tuple[Task, Outcome]]:
     """Outcomes in the order of completion; Dask itself gives the task of a dead worker to another one."""
     try:
         from distributed import Client, KilledWorker, as_completed  # only where it is asked for

@@ -1,6 +1,6 @@
 """The sweep engine on this machine and on a Dask cluster: what runs, what does not run again, what the file holds.
 
-Task functions are made inside other functions: cloudpickle then sends them as they are, and workers need not import tests.
+Task functions are made inside other functions: cloudpickle sends them as they are, and workers need not import tests.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def test_one_job_is_one_process_with_one_thread_and_one_task_at_once(work):
         lock = os.open(folder / "lock", os.O_CREAT | os.O_EXCL)  # raises if another task is at work
         time.sleep(0.05)
         os.close(lock)
-        os.unlink(folder / "lock")
+        (folder / "lock").unlink()
         assert os.environ["OMP_NUM_THREADS"] == os.environ["NUMBA_NUM_THREADS"] == "1"
 
     records = run_sweep([work.task(i, alone) for i in range(4)], work.file, jobs=1)
@@ -230,7 +230,9 @@ def test_a_cluster_that_goes_away(work):
     cluster = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
     address = cluster.scheduler_address
     with pytest.raises(InputError, match=f"the Dask scheduler at '{address}' is gone"):
-        run_sweep([work.task(0), work.task(1, seconds=30)], work.file, dask=address, on_record=lambda _: cluster.close())
+        run_sweep(
+            [work.task(0), work.task(1, seconds=30)], work.file, dask=address, on_record=lambda _: cluster.close()
+        )
     assert len(work.lines()) == 1
 
 

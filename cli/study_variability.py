@@ -1,0 +1,98 @@
+"""``ppcbf study variability``: the paper's Fig. 5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
+from ppcbf_robots.cli.tasks import (
+    RESULTS,
+    DaskOption,
+    IterationsOption,
+    JobsOption,
+    OutOption,
+    TimeLimitOption,
+    errors,
+    finite,
+    preset_with,
+    run_tasks,
+    seeds,
+)
+from ppcbf_robots.errors import CheckFailed
+from ppcbf_robots.learning.presets import PresetName
+from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.resources import portable
+from ppcbf_robots.results_file import Record
+from ppcbf_robots.specs import Array
+from ppcbf_robots.studies.tables import cell, write_table
+from ppcbf_robots.studies.training import Training
+from ppcbf_robots.studies.variability import overlaps, variability_rows
+
+
+def variability(
+    out_dir: OutOption,
+    robot: RobotArgument = "cartpole",
+    obstacles: WorldArgument = "wall",
+    seed_list: Annotated[str, typer.Option("--seeds", metavar="0-9", help="Seeds, such as 0-4 or 1,3,5.")] = "0-9",
+    preset: Annotated[PresetName, typer.Option(help="Recommended settings, or the paper's.")] = "default",
+    iterations: IterationsOption = None,
+    time_limit: TimeLimitOption = 3600.0,
+    jobs: JobsOption = 1,
+    dask: DaskOption = None,
+    json: JsonOption = False,
+) -> None:
+    """How much the barriers of different seeds differ: the paper's Fig. 5, training curves, overlap of the safe sets.
+
+    Writes results.jsonl, a barrier folder per seed, table.csv, table.md, curves.png and, for two joints or more,
+    boundaries.png; the same command goes on after an interrupt. Exits with 3, after the table, if a run ended with an
+    error.
+
+    Example: ppcbf study variability --preset paper --jobs 4 --out runs/variability
+    """
+    problem, limit, chosen = load_problem(robot, obstacles), finite(time_limit), preset_with(preset, iterations)
+    folders = [out_dir.resolve() / f"seed_{seed}" for seed in seeds(seed_list)]
+    tasks = [
+        Training(portable(robot), portable(obstacles), preset, chosen, seed, limit, folder).task(problem)
+        for seed, folder in zip(seeds(seed_list), folders, strict=True)
+    ]
+    records = run_tasks(tasks, out_dir, jobs, dask)
+    failed = errors(records)
+    if len(failed) == len(records):
+        raise CheckFailed(f"no run came to an end; the first error: {failed[0]}")
+    ended = [(record, folder) for record, folder in zip(records, folders, strict=True) if "result" in record]
+    barriers = [load_barrier(folder).barrier(problem) for _, folder in ended]
+    found = [record for record, _ in ended]
+    rows = variability_rows(found, overlaps(problem, barriers, np.random.default_rng(0)))
+    figures = _figures(problem, found, barriers, out_dir)
+    files = [str(path) for path in (out_dir / RESULTS, *write_table(rows, out_dir), *figures)]
+    if json:
+        emit_json({"rows": rows, "files": files})
+    else:
+        title = f"{robot} in {obstacles}, {preset} preset; overlap: of the safe set with those of the other seeds"
+        table(title, [name.replace("_", " ") for name in rows[0]], [[cell(x) for x in row.values()] for row in rows])
+        out.print("wrote " + ", ".join(files))
+    if failed:
+        raise CheckFailed(f"{len(failed)} of {len(records)} runs ended with an error; the first: {failed[0]}")
+
+
+def _figures(problem: Problem, records: list[Record], barriers: list[Barrier], out_dir: Path) -> list[Path]:
+    from ppcbf_robots.studies.figures import plot_boundaries, plot_curves  # matplotlib only where it is needed
+
+    curves, boundaries = out_dir / "curves.png", out_dir / "boundaries.png"
+    plot_curves([record["result"]["history"] for record in records], curves)
+    if problem.model.nv < 2:
+        return [curves]
+    plot_boundaries(problem, barriers, _velocities(problem), boundaries)
+    return [curves, boundaries]
+
+
+def _velocities(problem: Problem) -> list[Array]:
+    """At rest, at the paper's 0.5 where X allows it, and at half of X's largest."""
+    v_max = problem.robot.domain.v[:, 1]
+    return [np.zeros(len(v_max)), 0.5 * np.minimum(v_max, 1.0), 0.5 * v_max]

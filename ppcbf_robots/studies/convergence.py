@@ -1,0 +1,44 @@
+"""Table 1 of the paper: how often and how fast training converges, by learning rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ppcbf_robots.results_file import Record
+from ppcbf_robots.studies.tables import Row, mean
+
+TABLE_1 = {1e-3: (0.0, None), 1e-4: (0.7, 150), 5e-5: (0.85, 200), 1e-5: (1.0, 400), 5e-6: (1.0, 800)}
+"""The paper's share of converged runs and steps to converge, by learning rate (20 runs each)."""
+
+
+def convergence_rows(records: Sequence[Record]) -> list[Row]:
+    """One row per preset and learning rate, in their first order; records with an error are left out.
+
+    ``first_clean`` is the iteration of the first check without violations, ``steps`` are those to the end of the run;
+    both, the time and the volume are means over the converged runs.
+    """
+    groups: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    for record in records:
+        if "result" in record:
+            group = groups.setdefault((record["key"]["preset"], record["key"]["learning_rate"]), [])
+            group.append(record["result"])
+    return [_row(preset, rate, results) for (preset, rate), results in groups.items()]
+
+
+def _row(preset: str, rate: float, results: list[dict[str, Any]]) -> Row:
+    converged = [r for r in results if r["converged"]]
+    paper_share, paper_steps = TABLE_1.get(rate, (None, None))
+    return {
+        "preset": preset,
+        "rate": rate,
+        "runs": len(results),
+        "converged": len(converged) / len(results),
+        "collapsed": sum(r["reason"].startswith("collapsed") for r in results) / len(results),
+        "first_clean": mean([next(m["iteration"] for m in r["history"] if m["clean"]) for r in converged]),
+        "steps": mean([r["steps"] for r in converged]),
+        "seconds": mean([r["seconds"] for r in converged]),
+        "volume_kept": mean([r["volume_kept"] for r in converged]),
+        "paper_converged": paper_share,
+        "paper_steps": paper_steps,
+    }
