@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument
 from ppcbf_robots.cli.tasks import (
     RESULTS,
     DaskOption,
@@ -14,18 +14,18 @@ from ppcbf_robots.cli.tasks import (
     JobsOption,
     OutOption,
     TimeLimitOption,
-    errors,
+    ended,
     finite,
     preset_with,
     rates,
     run_tasks,
+    show_study,
 )
-from ppcbf_robots.errors import CheckFailed
 from ppcbf_robots.learning.presets import PresetName
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.resources import portable
 from ppcbf_robots.studies.convergence import TABLE_1, convergence_rows
-from ppcbf_robots.studies.tables import cell, write_table
+from ppcbf_robots.studies.tables import write_table
 from ppcbf_robots.studies.training import Training
 
 RATES = ",".join(f"{rate:g}" for rate in TABLE_1)
@@ -37,9 +37,7 @@ def convergence(
     obstacles: WorldArgument = "wall",
     runs: Annotated[int, typer.Option(min=1, max=10_000, help="Runs per learning rate; run i has seed i.")] = 20,
     rate_list: Annotated[str, typer.Option("--rates", metavar="R,...", help="Learning rates.")] = RATES,
-    preset: Annotated[
-        list[PresetName] | None, typer.Option(help="Settings; give it twice for both, which is the default.")
-    ] = None,
+    preset: Annotated[Literal["both", PresetName], typer.Option(help="Settings of the runs.")] = "both",
     iterations: IterationsOption = None,
     time_limit: TimeLimitOption = 3600.0,
     jobs: JobsOption = 1,
@@ -55,29 +53,21 @@ def convergence(
     Example: ppcbf study convergence --runs 20 --jobs 4 --out runs/convergence
     """
     problem, limit = load_problem(robot, obstacles), finite(time_limit)
+    chosen: list[PresetName] = ["paper", "default"] if preset == "both" else [preset]
     trainings = [
         Training(
             portable(robot), portable(obstacles), name, preset_with(name, iterations, learning_rate=rate), seed, limit
         )
-        for name in dict.fromkeys(preset or ["paper", "default"])
+        for name in chosen
         for rate in rates(rate_list)
         for seed in range(runs)
     ]
     records = run_tasks([training.task(problem) for training in trainings], out_dir, jobs, dask)
-    failed = errors(records)
-    if len(failed) == len(records):
-        raise CheckFailed(f"no run came to an end; the first error: {failed[0]}")
-    rows = convergence_rows(records)
+    rows = convergence_rows(ended(records))
     from ppcbf_robots.studies.figures import plot_convergence  # matplotlib only where it is needed
 
     figure = out_dir / "convergence.png"
     plot_convergence(rows, figure)
-    files = [str(path) for path in (out_dir / RESULTS, *write_table(rows, out_dir), figure)]
-    if json:
-        emit_json({"rows": rows, "files": files})
-    else:
-        title = f"{robot} in {obstacles}: shares of the runs, means over the converged ones, and the paper's Table 1"
-        table(title, [name.replace("_", " ") for name in rows[0]], [[cell(x) for x in row.values()] for row in rows])
-        out.print("wrote " + ", ".join(files))
-    if failed:
-        raise CheckFailed(f"{len(failed)} of {len(records)} runs ended with an error; the first: {failed[0]}")
+    files = [out_dir / RESULTS, *write_table(rows, out_dir), figure]
+    title = f"{robot} in {obstacles}: shares of the runs, means over the converged ones, and the paper's Table 1"
+    show_study(title, rows, files, json, records)

@@ -10,7 +10,7 @@ import typer
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument
 from ppcbf_robots.cli.tasks import (
     RESULTS,
     DaskOption,
@@ -18,19 +18,19 @@ from ppcbf_robots.cli.tasks import (
     JobsOption,
     OutOption,
     TimeLimitOption,
-    errors,
+    ended,
     finite,
     preset_with,
     run_tasks,
     seeds,
+    show_study,
 )
-from ppcbf_robots.errors import CheckFailed
 from ppcbf_robots.learning.presets import PresetName
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.resources import portable
 from ppcbf_robots.results_file import Record
 from ppcbf_robots.specs import Array
-from ppcbf_robots.studies.tables import cell, write_table
+from ppcbf_robots.studies.tables import write_table
 from ppcbf_robots.studies.training import Training
 from ppcbf_robots.studies.variability import overlaps, variability_rows
 
@@ -56,29 +56,22 @@ def variability(
     Example: ppcbf study variability --preset paper --jobs 4 --out runs/variability
     """
     problem, limit, chosen = load_problem(robot, obstacles), finite(time_limit), preset_with(preset, iterations)
-    folders = [out_dir.resolve() / f"seed_{seed}" for seed in seeds(seed_list)]
-    tasks = [
-        Training(portable(robot), portable(obstacles), preset, chosen, seed, limit, folder).task(problem)
-        for seed, folder in zip(seeds(seed_list), folders, strict=True)
+    trainings = [
+        Training(portable(robot), portable(obstacles), preset, chosen, seed, limit, _folder(out_dir, seed).resolve())
+        for seed in seeds(seed_list)
     ]
-    records = run_tasks(tasks, out_dir, jobs, dask)
-    failed = errors(records)
-    if len(failed) == len(records):
-        raise CheckFailed(f"no run came to an end; the first error: {failed[0]}")
-    ended = [(record, folder) for record, folder in zip(records, folders, strict=True) if "result" in record]
-    barriers = [load_barrier(folder).barrier(problem) for _, folder in ended]
-    found = [record for record, _ in ended]
+    records = run_tasks([training.task(problem) for training in trainings], out_dir, jobs, dask)
+    found = ended(records)
+    barriers = [load_barrier(_folder(out_dir, record["key"]["seed"])).barrier(problem) for record in found]
     rows = variability_rows(found, overlaps(problem, barriers, np.random.default_rng(0)))
     figures = _figures(problem, found, barriers, out_dir)
-    files = [str(path) for path in (out_dir / RESULTS, *write_table(rows, out_dir), *figures)]
-    if json:
-        emit_json({"rows": rows, "files": files})
-    else:
-        title = f"{robot} in {obstacles}, {preset} preset; overlap: of the safe set with those of the other seeds"
-        table(title, [name.replace("_", " ") for name in rows[0]], [[cell(x) for x in row.values()] for row in rows])
-        out.print("wrote " + ", ".join(files))
-    if failed:
-        raise CheckFailed(f"{len(failed)} of {len(records)} runs ended with an error; the first: {failed[0]}")
+    files = [out_dir / RESULTS, *write_table(rows, out_dir), *figures]
+    title = f"{robot} in {obstacles}, {preset} preset; overlap: of the safe set with those of the other seeds"
+    show_study(title, rows, files, json, records)
+
+
+def _folder(out_dir: Path, seed: int) -> Path:
+    return out_dir / f"seed_{seed}"
 
 
 def _figures(problem: Problem, records: list[Record], barriers: list[Barrier], out_dir: Path) -> list[Path]:

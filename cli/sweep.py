@@ -91,4 +91,4 @@ def _print(rows: Sequence[dict[str, Any]], out_dir: Path) -> None:
         for r in rows
     ]  # fmt: skip
     table(f"{len(rows)} trainings", columns, cells)
-    out.print(f"wrote {out_dir / RESULTS} and a barrier folder for each training in {out_dir}")
+    out.print(f"wrote {out_dir / RESULTS} and the barrier folders beside it")

@@ -11,10 +11,11 @@ from typing import Annotated, Any, TypeVar
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ppcbf_robots.cli.output import err
-from ppcbf_robots.errors import InputError
+from ppcbf_robots.cli.output import emit_json, err, out, table
+from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.learning.presets import PRESETS, Preset, PresetName
 from ppcbf_robots.results_file import Record
+from ppcbf_robots.studies.tables import Row, cell
 from ppcbf_robots.sweep import Task, run_sweep
 
 Value = TypeVar("Value")
@@ -56,10 +57,24 @@ def run_tasks(tasks: Sequence[Task], folder: Path, jobs: int, dask: str | None) 
             raise
 
 
-def errors(records: Sequence[Record]) -> list[str]:
-    """What went wrong where, one sentence per record with an error."""
-    return [f"{r['key']['robot']} {r['key']['world']} seed {r['key']['seed']}: {r['error']}"
-            for r in records if "error" in r]  # fmt: skip
+def ended(records: Sequence[Record]) -> list[Record]:
+    """The records with a result; CheckFailed if there is none."""
+    found = [record for record in records if "result" in record]
+    if not found:
+        raise CheckFailed(f"every run ended with an error; the first: {records[0]['error']}")
+    return found
+
+
+def show_study(title: str, rows: Sequence[Row], files: Sequence[Path], json: bool, records: Sequence[Record]) -> None:
+    """The result of a study on stdout; CheckFailed afterwards if some of its records hold an error."""
+    if json:
+        emit_json({"rows": list(rows), "files": [str(path) for path in files]})
+    else:
+        table(title, [name.replace("_", " ") for name in rows[0]], [[cell(x) for x in row.values()] for row in rows])
+        out.print(f"wrote {', '.join(map(str, files))}")
+    errors = [record["error"] for record in records if "error" in record]
+    if errors:
+        raise CheckFailed(f"{len(errors)} of {len(records)} runs ended with an error; the first: {errors[0]}")
 
 
 def preset_with(name: PresetName, iterations: int | None, **changes: Any) -> Preset:

@@ -13,16 +13,15 @@ TABLE_1 = {1e-3: (0.0, None), 1e-4: (0.7, 150), 5e-5: (0.85, 200), 1e-5: (1.0, 4
 
 
 def convergence_rows(records: Sequence[Record]) -> list[Row]:
-    """One row per preset and learning rate, in their first order; records with an error are left out.
+    """One row per preset and learning rate, in their first order, of records with results.
 
     ``first_clean`` is the iteration of the first check without violations, ``steps`` are those to the end of the run;
     both, the time and the volume are means over the converged runs.
     """
     groups: dict[tuple[str, float], list[dict[str, Any]]] = {}
     for record in records:
-        if "result" in record:
-            group = groups.setdefault((record["key"]["preset"], record["key"]["learning_rate"]), [])
-            group.append(record["result"])
+        key = record["key"]["preset"], record["key"]["learning_rate"]
+        groups.setdefault(key, []).append(record["result"])
     return [_row(preset, rate, results) for (preset, rate), results in groups.items()]
 
 
