@@ -86,6 +86,7 @@ def _figures(problem: Problem, records: list[Record], barriers: list[Barrier], o
 
 
 def _velocities(problem: Problem) -> list[Array]:
-    """At rest, at the paper's 0.5 where X allows it, and at half of X's largest."""
+    """At rest, at the paper's 0.5 where X allows it, and at half of X's largest where that is another one."""
     v_max = problem.robot.domain.v[:, 1]
-    return [np.zeros(len(v_max)), 0.5 * np.minimum(v_max, 1.0), 0.5 * v_max]
+    moving = np.unique([0.5 * np.minimum(v_max, 1.0), 0.5 * v_max], axis=0)
+    return [np.zeros(len(v_max)), *moving]

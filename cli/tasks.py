@@ -84,7 +84,7 @@ def preset_with(name: PresetName, iterations: int | None, **changes: Any) -> Pre
 
 
 def finite(time_limit: float) -> float:
-    """The option --time-limit, for NaN passes its lower bound."""
+    """The option --time-limit, which goes into the key of a task as JSON."""
     if not math.isfinite(time_limit):
         raise InputError(f"--time-limit must be finite, got {time_limit}")
     return time_limit
@@ -110,8 +110,8 @@ def seeds(text: str, option: str = "--seeds") -> list[int]:
     """Seeds such as ``0-4,7``, each once."""
 
     def parse(part: str) -> range:
-        first, _, last = part.partition("-")
-        found = range(int(first), int(last or first) + 1)
+        first, dash, last = part.partition("-")
+        found = range(int(first), int(last if dash else first) + 1)
         if not 0 < len(found) <= MAX_SEEDS or found[-1] >= 2**63:
             raise ValueError
         return found

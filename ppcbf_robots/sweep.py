@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed, parallel_config
-
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.results_file import Record, ResultsFile, name_of
 
@@ -99,6 +97,7 @@ def _locally(tasks: Sequence[Task], jobs: int) -> Generator[tuple[Task, Outcome]
 
 def _pool(tasks: Sequence[Task], jobs: int, attempts: Counter[str]) -> Iterator[tuple[str, Outcome]]:
     """Names and outcomes from a pool of worker processes; counts every task that it hands out."""
+    from joblib import Parallel, delayed, parallel_config  # every command would start a fifth of a second later
 
     def hand_out() -> Iterator[Any]:
         for task in tasks:

@@ -34,10 +34,15 @@ def _row(preset: str, rate: float, results: list[dict[str, Any]]) -> Row:
         "runs": len(results),
         "converged": len(converged) / len(results),
         "collapsed": sum(r["reason"].startswith("collapsed") for r in results) / len(results),
-        "first_clean": mean([next(m["iteration"] for m in r["history"] if m["clean"]) for r in converged]),
+        "first_clean": mean([i for r in converged for i in _clean_checks(r)[:1]]),
         "steps": mean([r["steps"] for r in converged]),
         "seconds": mean([r["seconds"] for r in converged]),
         "volume_kept": mean([r["volume_kept"] for r in converged]),
         "paper_converged": paper_share,
         "paper_steps": paper_steps,
     }
+
+
+def _clean_checks(result: dict[str, Any]) -> list[int]:
+    """Iterations of the checks without violations."""
+    return [m["iteration"] for m in result["history"] if m["clean"]]
