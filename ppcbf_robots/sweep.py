@@ -13,8 +13,9 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -106,13 +107,21 @@ def _pool(tasks: Sequence[Task], jobs: int, attempts: Counter[str]) -> Iterator[
 
     # joblib runs everything in this process if n_jobs is 1, so pre_dispatch says how many tasks there are at once
     pool = {"n_jobs": max(jobs, 2), "pre_dispatch": jobs, "batch_size": 1, "return_as": "generator_unordered"}
-    with parallel_config(backend="loky", inner_max_num_threads=1, initializer=_leave_interrupts_to_the_parent):
-        yield from Parallel(**pool)(hand_out())
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        with _interrupts_blocked():  # a terminal's Ctrl-C reaches all processes, but this one ends its workers itself
+            outcomes = Parallel(**pool)(hand_out())
+    yield from outcomes
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent ends its workers itself."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Ctrl-C waits until the end, and never comes to threads and processes that are started here."""
+    resource_tracker.ensure_running()  # its first start unblocks them
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _on_dask(tasks: Sequence[Task], address: str) -> Generator[tuple[Task, Outcome]]:

@@ -32,7 +32,7 @@ LAYERS = [
     ["studies"],
     ["cli"],
 ]
-"""From the bottom up; world_files, learning, studies and cli are packages. A module imports from its layer and below."""
+"""From the bottom up, some of them packages. A module imports from lower layers and its own."""
 
 OWNERS = {
     "numba": ["kernels"],

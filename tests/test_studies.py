@@ -110,8 +110,8 @@ def test_other_settings_are_other_tasks(cli, tmp_path):
 
 
 def test_a_training_that_cannot_be_done_does_not_end_the_sweep(cli, tmp_path):
-    wall = "{name: b, type: half_space, normal: [-1, 0, 0], offset: -0.01}"
-    (tmp_path / "everywhere.yaml").write_text(f"obstacles: [{wall}]\n")
+    ball = "{name: b, type: sphere, center: [5, 0, 5], radius: 7.07}"
+    (tmp_path / "everywhere.yaml").write_text(f"obstacles: [{ball}]\n")
     done = cli("sweep", "--robots", "two_link", "--worlds", "everywhere.yaml,circle", *SMALL, "--out", "runs")
     assert done.code == 3
     assert "of 2 trainings failed or did not converge" in done.stderr
