@@ -107,9 +107,9 @@ def _pool(tasks: Sequence[Task], jobs: int, attempts: Counter[str]) -> Iterator[
 
     # joblib runs everything in this process if n_jobs is 1, so pre_dispatch says how many tasks there are at once
     pool = {"n_jobs": max(jobs, 2), "pre_dispatch": jobs, "batch_size": 1, "return_as": "generator_unordered"}
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        with _interrupts_blocked():  # a terminal's Ctrl-C reaches all processes, but this one ends its workers itself
-            outcomes = Parallel(**pool)(hand_out())
+    # a terminal's Ctrl-C reaches all processes, but this one ends its workers itself
+    with parallel_config(backend="loky", inner_max_num_threads=1), _interrupts_blocked():
+        outcomes = Parallel(**pool)(hand_out())
     yield from outcomes
 
 
