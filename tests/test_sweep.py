@@ -169,7 +169,10 @@ def test_a_result_that_is_no_json_is_an_error_of_its_task(work):
     assert record["error"].startswith("ValueError: Out of range float")
 
 
-def test_one_job_is_one_process_with_one_thread_and_one_task_at_once(work):
+def test_one_job_is_one_process_with_one_thread_and_one_task_at_once(work, monkeypatch):
+    monkeypatch.setattr(
+        "joblib._parallel_backends.cpu_count", lambda: 8
+    )  # so that joblib would give a worker 4 threads
     folder = work.folder
 
     def alone(begun: int) -> None:
@@ -185,6 +188,18 @@ def test_one_job_is_one_process_with_one_thread_and_one_task_at_once(work):
     records = run_sweep([work.task(i, alone) for i in range(4)], work.file, jobs=1)
     assert all("result" in r for r in records), records
     assert os.getpid() not in work.begun(0)
+
+
+def test_an_interrupt_does_not_reach_a_worker(work):
+    def run() -> dict[str, Any]:
+        import signal
+
+        return {"blocked": signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])}
+
+    assert run() == {"blocked": False}
+    [record] = run_sweep([Task({"i": 0}, run)], work.file)
+    assert record["result"] == {"blocked": True}
+    assert run() == {"blocked": False}
 
 
 def test_a_half_written_last_line_is_run_again(work):
