@@ -16,6 +16,8 @@ from ppcbf_robots.cli.export import export
 from ppcbf_robots.cli.info import info
 from ppcbf_robots.cli.output import err
 from ppcbf_robots.cli.simulate import simulate
+from ppcbf_robots.cli.study import study
+from ppcbf_robots.cli.sweep import sweep
 from ppcbf_robots.cli.train import train
 from ppcbf_robots.cli.view import view
 from ppcbf_robots.errors import PPCBFError
@@ -26,10 +28,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
-    "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed.",
+    "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed, 130 stopped by Ctrl-C.",
 )
-for command in (bench, info, train, simulate, compare, view, export, convert):
+for command in (bench, info, train, simulate, compare, view, export, convert, sweep):
     app.command()(command)
+app.add_typer(study, name="study")
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from ppcbf_robots.engines import Engine, EngineName
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
+from ppcbf_robots.resources import portable
 from ppcbf_robots.rollout import RK4_STEP, Trajectory
 from ppcbf_robots.rollout import simulate as rollout
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -123,8 +124,8 @@ def run(
     if barrier is not None:
         runtime = SafetyFilter(problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd)
     described = {
-        "robot": _portable(problem.robot.name),
-        "obstacles": _portable(problem.world_name),
+        "robot": portable(problem.robot.name),
+        "obstacles": portable(problem.world_name),
         "barrier_kind": barrier.kind if barrier else "none",
         "filter": config.kind if barrier else "none",
         "metric": config.metric if barrier else "none",
@@ -150,11 +151,6 @@ def _mujoco(problem: Problem) -> Engine:
             '--engine mujoco needs the mujoco package; remedy: pip install "ppcbf-robots[mujoco]"'
         ) from None
     return MujocoEngine(problem)
-
-
-def _portable(name: str) -> str:
-    """Paths are stored absolute, so that the trajectory can be viewed from any folder."""
-    return str(Path(name).resolve()) if Path(name).is_file() else name
 
 
 def _angles(problem: Problem, text: str | None, what: str, default: Array) -> Array:

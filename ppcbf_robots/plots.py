@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 
@@ -17,7 +17,9 @@ from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.benchmark import Case
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem
+from ppcbf_robots.robot import Dynamics
 from ppcbf_robots.rollout import Trajectory
+from ppcbf_robots.safety import SafetyRows
 from ppcbf_robots.specs import Array
 from ppcbf_robots.world import HalfSpace, Obstacle, Sphere
 from ppcbf_robots.world_shapes import surface_points
@@ -52,7 +54,7 @@ def plot_runs(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> N
         ax.grid(alpha=0.3)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="upper center", ncols=min(4, len(labels)), frameon=False)
-    _save(fig, path, top=1.0 - 0.5 / (2.3 * (joints + 1)))
+    save_figure(fig, path, top=1.0 - 0.5 / (2.3 * (joints + 1)))
 
 
 def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> None:
@@ -70,7 +72,7 @@ def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> 
         ax.set_aspect("equal", adjustable="datalim")
         ax.grid(alpha=0.3)
     axes[0].legend(frameon=False)
-    _save(fig, path)
+    save_figure(fig, path)
 
 
 def _draw_obstacle(ax: Any, obstacle: Obstacle, k: int) -> None:
@@ -112,31 +114,61 @@ def _tip_path(problem: Problem, run: Trajectory) -> Array:
     return problem.safety.points.kinematics(dyn).p[:, -1]
 
 
-def plot_safe_set(problem: Problem, barriers: Mapping[str, Barrier], velocities: list[Array], path: Path) -> None:
-    """Slices of safe sets over the first two joints at given velocities (Fig. 5, 7); other joints at the start."""
-    fig, axes = plt.subplots(1, len(velocities), figsize=(6 * len(velocities), 5), squeeze=False)
+class Slice(NamedTuple):
+    """States over the first two joints at one velocity."""
+
+    x: Array  # (N, N) position of the first joint
+    y: Array  # (N, N) of the second
+    dyn: Dynamics
+    safety: SafetyRows
+
+    @property
+    def h(self) -> Array:
+        """Least h (N, N)."""
+        return np.asarray(self.safety.h.min(-1).reshape(self.x.shape))
+
+    def phi(self, barrier: Barrier) -> Array:
+        """Least phi of a barrier (N, N)."""
+        return np.asarray(barrier.rows(self.dyn, self.safety).phi.min(-1).reshape(self.x.shape))
+
+
+def safe_set_slices(problem: Problem, velocities: Sequence[Array], beyond: float = 0.0) -> Iterator[Slice]:
+    """Slices over the first two joints, reaching ``beyond`` of X's width past its bounds; other joints at the start."""
     domain, model = problem.robot.domain, problem.model
-    x, y = (np.linspace(domain.q[i, 0], domain.q[i, 1], GRID) for i in (0, 1))
+    reach = beyond * (domain.q[:, 1] - domain.q[:, 0])
+    x, y = (np.linspace(domain.q[i, 0] - reach[i], domain.q[i, 1] + reach[i], GRID) for i in (0, 1))
     X, Y = np.meshgrid(x, y)
     angles = np.tile(model.to_angles(problem.robot.start), (X.size, 1))
     angles[:, 0], angles[:, 1] = X.ravel(), Y.ravel()
     q = model.from_angles(angles)
-    for ax, v in zip(axes[0], velocities, strict=True):
+    for v in velocities:
         dyn = model.evaluate_batch(q, np.tile(v, (len(q), 1)))
-        safety = problem.safety.evaluate(dyn)
-        ax.contourf(X, Y, safety.h.min(-1).reshape(X.shape), levels=[-1e9, 0.0], colors=["0.8"])
+        yield Slice(X, Y, dyn, problem.safety.evaluate(dyn))
+
+
+def slice_title(what: str, v: Array) -> str:
+    """The title of a slice at velocity v (nv,)."""
+    return f"{what} at v = (" + ", ".join(f"{s:g}" for s in v[:4]) + ("...)" if len(v) > 4 else ")")
+
+
+def plot_safe_set(problem: Problem, barriers: Mapping[str, Barrier], velocities: list[Array], path: Path) -> None:
+    """Slices of safe sets over the first two joints at given velocities (Fig. 5, 7); other joints at the start."""
+    fig, axes = plt.subplots(1, len(velocities), figsize=(6 * len(velocities), 5), squeeze=False)
+    names = problem.model.joint_names
+    for ax, v, cut in zip(axes[0], velocities, safe_set_slices(problem, velocities), strict=True):
+        ax.contourf(cut.x, cut.y, cut.h, levels=[-1e9, 0.0], colors=["0.8"])
         for i, (label, barrier) in enumerate(barriers.items()):
-            phi = barrier.rows(dyn, safety).phi.min(-1).reshape(X.shape)
-            ax.contour(X, Y, phi, levels=[0.0], colors=[f"C{i}"])
+            ax.contour(cut.x, cut.y, cut.phi(barrier), levels=[0.0], colors=[f"C{i}"])
             ax.plot([], [], color=f"C{i}", label=label)
-        ax.set_title("safe sets at v = (" + ", ".join(f"{s:g}" for s in v[:4]) + ("...)" if len(v) > 4 else ")"))
-        ax.set_xlabel(model.joint_names[0])
-        ax.set_ylabel(model.joint_names[1])
+        ax.set_title(slice_title("safe sets", v))
+        ax.set_xlabel(names[0])
+        ax.set_ylabel(names[1])
         ax.legend(frameon=False)
-    _save(fig, path)
+    save_figure(fig, path)
 
 
-def _save(fig: Any, path: Path, top: float = 1.0) -> None:
+def save_figure(fig: Any, path: Path, top: float = 1.0) -> None:
+    """Write a figure, with its folder, and close it; InputError if that cannot be done."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         fig.tight_layout(rect=(0, 0, 1, top))
@@ -168,4 +200,4 @@ def plot_bench(cases: Sequence[Case], robot: str, path: Path) -> None:
         ax.set_ylim(bottom=0.0)
     axes[0].set_ylabel("filter step [µs]")
     axes[0].legend(frameon=False, fontsize=8)
-    _save(fig, path)
+    save_figure(fig, path)

@@ -65,6 +65,11 @@ def find_world(name: str) -> Path:
     )
 
 
+def portable(name: str) -> str:
+    """A robot or world by a name that holds in any folder: paths become absolute."""
+    return str(Path(name).resolve()) if Path(name).is_file() else name
+
+
 def _example_urdfs() -> dict[str, Path]:
     try:
         distribution = importlib.metadata.distribution("example-robot-data")

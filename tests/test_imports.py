@@ -13,6 +13,8 @@ import pytest
 
 LAYERS = [
     ["errors"],
+    ["results_file"],
+    ["sweep"],
     ["specs", "resources", "kernels"],
     ["network_kernel"],
     ["urdf", "urdf_parts", "world", "body", "body_geometry", "body_fit", "body_cache"],
@@ -27,9 +29,10 @@ LAYERS = [
     ["benchmark"],
     ["learning"],
     ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
+    ["studies"],
     ["cli"],
 ]
-"""From the bottom up; world_files, learning and cli are packages. A module imports from lower layers and its own."""
+"""From the bottom up, some of them packages. A module imports from lower layers and its own."""
 
 OWNERS = {
     "numba": ["kernels"],
@@ -38,14 +41,20 @@ OWNERS = {
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
-    "matplotlib": ["plots"],
+    "matplotlib": ["plots", "studies.figures"],
     "mujoco": ["engine_mujoco"],
     "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
-    "torch": ["learning", "export", "cli"],
+    "torch": ["learning", "export", "studies", "cli"],
+    "joblib": ["sweep"],
+    "distributed": ["sweep"],
 }
-LAZY = {"torch": ["export", "cli"]}  # there only inside functions
+LAZY = {
+    "torch": ["export", "studies", "cli"],
+    "distributed": ["sweep"],
+    "joblib": ["sweep"],
+}  # there only inside functions
 
 PACKAGE = "ppcbf_robots"
 ROOT = Path(__file__).parent.parent
@@ -53,6 +62,7 @@ SOURCES = {
     **{p.stem: p for p in (ROOT / PACKAGE).glob("*.py")},
     **{f"learning.{p.stem}": p for p in (ROOT / PACKAGE / "learning").glob("*.py")},
     **{f"world_files.{p.stem}": p for p in (ROOT / PACKAGE / "world_files").glob("*.py")},
+    **{f"studies.{p.stem}": p for p in (ROOT / PACKAGE / "studies").glob("*.py")},
     **{f"cli.{p.stem}": p for p in (ROOT / "cli").glob("*.py")},
 }
 MODULES = sorted(name for name in SOURCES if name.split(".")[-1] != "__init__")
@@ -129,7 +139,7 @@ def test_libraries_stay_with_their_owners(library):
 
 @pytest.mark.parametrize("module", ["safety_filter", "rollout", "artefact", "problem", "cli.main"])
 def test_the_runtime_starts_without_heavy_libraries(module):
-    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco"]
+    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco", "joblib", "distributed"]
     code = f"import sys, {PACKAGE}.{module}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

@@ -20,6 +20,9 @@ SMALLER = {
     "simulate": ["--duration", "0.2"],
     "bench": ["--steps", "100"],
     "compare": ["--iterations", "30", "--duration", "0.3"],
+    "sweep": ["--robots", "two_link", "--worlds", "circle", "--seeds", "0", "--iterations", "10"],
+    "study convergence": ["--runs", "1", "--rates", "1e-4", "--preset", "default", "--iterations", "10"],
+    "study variability": ["--seeds", "0", "--iterations", "10"],
 }
 
 
@@ -34,18 +37,24 @@ def commands() -> list[list[str]]:
     return [w[1:] for w in words if w and Path(w[0]).name == "ppcbf"]
 
 
+def name_of(arguments: list[str]) -> str:
+    """The command, with the one below it if it is a group."""
+    return " ".join(arguments[: 2 if arguments[0] == "study" else 1])
+
+
 def test_the_readme_names_every_command() -> None:
-    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare", "convert", "bench"}
+    one = {"info", "train", "simulate", "view", "export", "compare", "convert", "bench", "sweep"}
+    assert {name_of(c) for c in commands()} == one | {"study convergence", "study variability"}
 
 
 @pytest.mark.slow
 def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for arguments in commands():
-        monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(arguments[0], [])])
+        monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(name_of(arguments), [])])
         with pytest.raises(SystemExit) as exit_info:
             main()
-        allowed = {0, 3} if arguments[0] in ("train", "compare") else {0}  # reduced training may not converge
+        allowed = {0, 3} if arguments[0] in ("train", "compare", "sweep") else {0}  # reduced training may not converge
         assert exit_info.value.code in allowed, arguments
         for name in ("--out", "--html"):
             if name in arguments:

@@ -1,0 +1,1 @@
+"""Studies over many trainings: what a single run cannot show."""

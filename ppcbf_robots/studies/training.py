@@ -1,0 +1,85 @@
+"""One training as a task of a sweep."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from ppcbf_robots.artefact import save_barrier
+from ppcbf_robots.learning.presets import Preset, PresetName
+from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.sweep import Task
+
+KIND: Final = "pp-ncbf"
+
+
+@dataclass(frozen=True)
+class Training:
+    """How to train a PP-NCBF for a robot in a world; small and picklable, so that any worker can do it."""
+
+    robot: str  # names or absolute paths, as the worker may run in another folder
+    world: str
+    preset_name: PresetName
+    preset: Preset
+    seed: int
+    time_limit: float  # [s]
+    folder: Path | None = None  # absolute; where to write the barrier, if it is wanted
+
+    def task(self, problem: Problem) -> Task:
+        """The task of a sweep; its key holds all that the outcome depends on: robot, world and preset as a hash."""
+        robot = problem.robot
+        facts = [problem.fingerprint(), robot.start.tolist(), robot.start_velocity.tolist(), robot.goal.tolist(),
+                 robot.spec.barrier.model_dump(), dataclasses.asdict(self.preset)]  # fmt: skip
+        key = {
+            "robot": self.robot,
+            "world": self.world,
+            "preset": self.preset_name,
+            "learning_rate": self.preset.learning_rate,
+            "iterations": self.preset.iterations,
+            "seed": self.seed,
+            "time_limit": self.time_limit,
+            "identity": hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16],
+        }
+        return Task(key, self.run)
+
+    def run(self) -> dict[str, Any]:
+        """Train with one thread, write the barrier if it is wanted, and report as JSON."""
+        import torch  # in the worker alone
+
+        from ppcbf_robots.learning.train import Trainer
+
+        torch.set_num_threads(1)
+        problem = load_problem(self.robot, self.world)
+        trainer = Trainer(problem, KIND, self.preset, self.seed, "cpu")
+        result = trainer.run(time_limit=self.time_limit)
+        report = {
+            "converged": result.converged,
+            "reason": result.reason,
+            "volume_kept": result.volume_kept,
+            "violations": result.check.violations,
+            "samples": result.check.samples,
+            "steps": result.steps,
+            "seconds": result.seconds,
+            "history": [
+                {
+                    "iteration": m.iteration,
+                    "loss": m.loss if math.isfinite(m.loss) else None,
+                    "volume_kept": m.volume_kept,
+                    "torque": m.torque,
+                    "passivity": m.passivity,
+                    "clean": m.clean,
+                }
+                for m in result.history
+            ],
+        }
+        if self.folder is not None:
+            details = {**report, "preset": self.preset_name, "seed": self.seed, "device": "cpu", "kind": KIND,
+                       "iterations": self.preset.iterations, "start_inside": result.start_inside}  # fmt: skip
+            config = trainer.filter_config
+            save_barrier(self.folder, problem, KIND, self.preset.network, result.params, config, details)
+        return report
