@@ -16,6 +16,7 @@ from ppcbf_robots.cli.export import export
 from ppcbf_robots.cli.info import info
 from ppcbf_robots.cli.output import err
 from ppcbf_robots.cli.simulate import simulate
+from ppcbf_robots.cli.study import study
 from ppcbf_robots.cli.train import train
 from ppcbf_robots.cli.view import view
 from ppcbf_robots.errors import PPCBFError
@@ -30,6 +31,7 @@ app = typer.Typer(
 )
 for command in (bench, info, train, simulate, compare, view, export, convert):
     app.command()(command)
+app.add_typer(study, name="study")
 
 
 def main() -> None:

@@ -52,7 +52,7 @@ def plot_runs(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> N
         ax.grid(alpha=0.3)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="upper center", ncols=min(4, len(labels)), frameon=False)
-    _save(fig, path, top=1.0 - 0.5 / (2.3 * (joints + 1)))
+    save(fig, path, top=1.0 - 0.5 / (2.3 * (joints + 1)))
 
 
 def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> None:
@@ -70,7 +70,7 @@ def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> 
         ax.set_aspect("equal", adjustable="datalim")
         ax.grid(alpha=0.3)
     axes[0].legend(frameon=False)
-    _save(fig, path)
+    save(fig, path)
 
 
 def _draw_obstacle(ax: Any, obstacle: Obstacle, k: int) -> None:
@@ -133,10 +133,11 @@ def plot_safe_set(problem: Problem, barriers: Mapping[str, Barrier], velocities:
         ax.set_xlabel(model.joint_names[0])
         ax.set_ylabel(model.joint_names[1])
         ax.legend(frameon=False)
-    _save(fig, path)
+    save(fig, path)
 
 
-def _save(fig: Any, path: Path, top: float = 1.0) -> None:
+def save(fig: Any, path: Path, top: float = 1.0) -> None:
+    """Write and close a figure; InputError where it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         fig.tight_layout(rect=(0, 0, 1, top))
@@ -168,4 +169,4 @@ def plot_bench(cases: Sequence[Case], robot: str, path: Path) -> None:
         ax.set_ylim(bottom=0.0)
     axes[0].set_ylabel("filter step [µs]")
     axes[0].legend(frameon=False, fontsize=8)
-    _save(fig, path)
+    save(fig, path)

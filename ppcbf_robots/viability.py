@@ -5,11 +5,12 @@ affine in the torque, so with p = ∂V/∂q and s = ∂V/∂v
 
     max_u dV/dt = p·v + s·a_0 + Σ_i |(M⁻¹ s)_i| u_max,i,     a_0 = -M⁻¹ (C v + g).
 
-Starting from V = h, which is above the solution, V is swept downwards: gradients by the WENO3 scheme of hj_reachability,
-a local Lax-Friedrichs Hamiltonian, two-stage Runge-Kutta steps, and ``V <= h`` after each. Only the limit matters, not the
-way there, so every node takes the step that its own speeds allow (four times fewer sweeps than with one step for all).
+Starting from V = h, which is above the solution, V is swept downwards: gradients by the WENO3 scheme of
+hj_reachability, a local Lax-Friedrichs Hamiltonian, two-stage Runge-Kutta steps, and ``V <= h`` after each. Only the
+limit matters, not the way there, so every node takes the step that its own speeds allow (four times fewer sweeps than
+with one step for all).
 
-M⁻¹, g and C v, which is quadratic in v, come from Pinocchio at the nodes; V(·, 0) is the least of all rows of the safety
+M⁻¹, g and C v, which is quadratic in v, come from Pinocchio at the nodes; h is the least of all rows of the safety
 function, joint limits included. The velocity rows of a guarded X are no part of it: the filter gives them up first.
 
 **The edge of X is no wall.** A motion that leaves X without touching anything is safe, so the grid reaches beyond X:
@@ -36,7 +37,7 @@ from ppcbf_robots.specs import Array
 from ppcbf_robots.viable_set import Nodes, ViableSet, keep, recall
 
 VERSION = 1  # of the method: another one finds nothing in the cache
-NODES = 41  # per axis
+NODES = 31  # per axis
 BEYOND_Q = 0.2  # of X's width, by which the grid reaches beyond X on either side
 BEYOND_V = 1.0
 CFL = 0.8

@@ -1,4 +1,4 @@
-"""The largest viable set of a robot with two joints, as a function of the state; :mod:`ppcbf_robots.viability` finds it.
+"""The largest viable set of a robot with two joints, as a function of the state (found by ``viability``).
 
 ``value(q, v)`` is the least h that remains, at best, on the way from (q, v): ``max_u min_t min_k h_k(q(t))`` over all
 torques in the box, for all time to come. The state is viable where it is not negative.
