@@ -1,8 +1,8 @@
 """Which states a nonlinear model predictive controller finds safe: section 5.4 and Fig. 6 of the paper.
 
 From each initial state one optimal control problem is solved by IPOPT: N steps of dt (RK4, torque held, multiple
-shooting), ``|u| <= u_max`` and ``h_k >= 0`` at every step. A state counts as safe if a trajectory that meets all of this
-is found within the allowed iterations. The paper leaves open what is minimised; here it is
+shooting), ``|u| <= u_max`` and ``h_k >= 0`` at every step. A state counts as safe if a trajectory that meets all of
+this is found within the allowed iterations. The paper leaves open what is minimised; here it is
 
     Σ |q - q_d|² + 0.1 |v|² + 0.001 |u / u_max|²
 
@@ -62,8 +62,8 @@ class Planner:
             cost += ca.dot(offset, offset) + SPEED_WEIGHT * ca.dot(v, v) + TORQUE_WEIGHT * ca.dot(u[k], u[k])
         kept = [h(xk[:nv]) for xk in x[1:]]
         self.shooting, self.rows = 2 * nv * settings.steps, problem.safety.rows * settings.steps
-        nlp = {"x": ca.vertcat(*x[1:], *u), "p": start, "f": cost, "g": ca.vertcat(*gaps, *kept)}
-        options = {"ipopt.max_iter": settings.iterations, "ipopt.print_level": 0, "print_time": False,
+        nlp: dict[str, Any] = {"x": ca.vertcat(*x[1:], *u), "p": start, "f": cost, "g": ca.vertcat(*gaps, *kept)}
+        options: dict[str, Any] = {"ipopt.max_iter": settings.iterations, "ipopt.print_level": 0, "print_time": False,
                    "ipopt.sb": "yes", "error_on_fail": False}  # fmt: skip
         self.solver = ca.nlpsol("nmpc", "ipopt", nlp, options)
 

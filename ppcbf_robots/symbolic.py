@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.specs import Array
-from ppcbf_robots.world import HalfSpace, Sphere
+from ppcbf_robots.world import HalfSpace, Obstacle, Sphere
 
 
 @dataclass(frozen=True)
@@ -66,11 +65,11 @@ def forward_dynamics(robot: RobotModel) -> ca.Function:
         c.append(cross @ (joint.S * v[i]))
         I_A.append(ca.SX(ca.DM(joint.inertia)))
         p_A.append(-cross.T @ joint.inertia @ velocity[-1])
-    U, D, rest = [None] * nv, [None] * nv, [None] * nv
+    U, D, rest = ([ca.SX()] * nv for _ in range(3))
     for i in reversed(range(nv)):
         S, parent = joints[i].S, joints[i].parent - 1
         U[i] = I_A[i] @ S
-        D[i], rest[i] = ca.dot(S, U[i]), u[i] - ca.dot(S, p_A[i])
+        D[i], rest[i] = ca.dot(ca.DM(S), U[i]), u[i] - ca.dot(ca.DM(S), p_A[i])
         if parent >= 0:
             I_a = I_A[i] - U[i] @ U[i].T / D[i]
             I_A[parent] += X[i].T @ I_a @ X[i]
@@ -96,19 +95,14 @@ def _cross(motion: Any) -> Any:
 
 
 def safety_rows(safety: SafetyFunction) -> ca.Function:
-    """``h = f(angles)``: distances of the body spheres to the obstacles [m], then joint limits, as the safety function's.
+    """``h = f(angles)``: distances of body spheres to obstacles [m], then joint limits: the safety function's rows.
 
     Raises:
         InputError: if an obstacle is neither a sphere nor a half-space, or body spheres are watched against each other.
     """
     robot = safety.robot
-    other = [o.name for o in safety.obstacles if not isinstance(o, Sphere | HalfSpace)]
-    if other:
-        raise InputError(f"the predictive controller knows spheres and half-spaces, '{other[0]}' is neither")
     if safety.pairs > len(safety.body) * len(safety.obstacles):
-        raise InputError(
-            "the predictive controller knows no self-collision; leave self_collision out of the robot spec"
-        )
+        raise InputError("the predictive controller knows no self-collision: leave it out of the robot spec")
     angles = ca.SX.sym("q", robot.nv)
     frames: list[tuple[Any, Any]] = [(ca.SX.eye(3), ca.SX.zeros(3))]
     for i, joint in enumerate(_joints(robot)):
@@ -118,12 +112,16 @@ def safety_rows(safety: SafetyFunction) -> ca.Function:
     for body, at, offset in zip(safety.body, safety.points.joints, safety.points.offsets, strict=True):
         R, p = frames[at]
         point = p + R @ offset[:3]
-        for o in safety.obstacles:
-            distance = (
-                ca.norm_2(point - np.array(o.center)) - o.radius
-                if isinstance(o, Sphere)
-                else ca.dot(np.array(o.normal), point) - o.offset
-            )
-            h.append(distance - body.radius - o.margin)
+        h += [_distance(o, point) - body.radius - o.margin for o in safety.obstacles]
     h += [sign * (angles[i] - bound) for i, sign, bound in safety.limits]
     return ca.Function("h", [angles], [ca.vertcat(*h)])
+
+
+def _distance(obstacle: Obstacle, point: Any) -> Any:
+    """Distance [m] of a point (3,) in the base frame to an obstacle, margin not counted."""
+    match obstacle:
+        case Sphere():
+            return ca.norm_2(point - ca.DM(obstacle.center)) - obstacle.radius
+        case HalfSpace():
+            return ca.dot(ca.DM(obstacle.normal), point) - obstacle.offset
+    raise InputError(f"the predictive controller knows spheres and half-spaces, '{obstacle.name}' is neither")

@@ -14,14 +14,15 @@ M⁻¹, g and C v, which is quadratic in v, come from Pinocchio at the nodes; h 
 function, joint limits included. The velocity rows of a guarded X are no part of it: the filter gives them up first.
 
 **The edge of X is no wall.** A motion that leaves X without touching anything is safe, so the grid reaches beyond X:
-braking one joint hard may drive another far beyond its range for a while. At the grid's own edge the state is held,
-which is too kind to motions beyond it; the more the grid reaches beyond X, the less that counts.
+braking one joint hard may drive another far beyond its range for a while. Beyond the grid's own edge what is still to
+be lost, V - h, counts as at the edge; the more the grid reaches beyond X, the less that matters.
 
 Needs the extra ``study`` (jax, hj_reachability).
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -30,6 +31,7 @@ import hj_reachability as hj
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hj_reachability.finite_differences.upwind_first import WENO3
 
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem
@@ -41,9 +43,13 @@ NODES = 31  # per axis
 BEYOND_Q = 0.2  # of X's width, by which the grid reaches beyond X on either side
 BEYOND_V = 1.0
 CFL = 0.8
-TOLERANCE = 1e-4  # [m], largest change of V in one sweep when it counts as settled
+TOLERANCE = 1e-4  # [m], largest change of V in one sweep when it counts as settled,
+NEAR = 0.2  # [m], where V is at least -NEAR: V is constant along the best motions, so what lies deeper has no say
 SWEEPS = 25  # between two looks at the change
 MAX_SWEEPS = 3000
+
+GHOSTS = 2  # nodes beyond an edge that WENO3 looks at
+INNER = slice(GHOSTS, -GHOSTS)
 
 OnSweeps = Callable[[int, float], None]
 
@@ -51,7 +57,7 @@ OnSweeps = Callable[[int, float], None]
 class Tables(NamedTuple):
     """What the dynamics are on the grid, from Pinocchio; nodes of the two joints first."""
 
-    h: Array  # (n1, n2) least row of the safety function
+    h: Array  # (n1 + 4, n2 + 4) least row of the safety function, also at the GHOSTS nodes beyond each edge
     Minv: Array  # (n1, n2, 2, 2)
     a_0: Array  # (n1, n2, 2, 4): acceleration without torque, to be multiplied by 1, v1², v1 v2, v2²
     u_max: Array  # (2,)
@@ -107,21 +113,27 @@ def place_nodes(problem: Problem, count: tuple[int, int, int, int], beyond_v: fl
 def tabulate(problem: Problem, grid: Nodes) -> Tables:
     """Dynamics and h at the nodes of the two joints."""
     model, axes = problem.model, grid.axes[:2]
-    angles = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    q = model.from_angles(angles)
+    q = model.from_angles(_pairs(axes))
     rest, first, second, both = (
         model.evaluate_batch(q, np.tile(v, (len(q), 1))) for v in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0])
     )
     bias = np.stack([rest.g, first.Cv, both.Cv - first.Cv - second.Cv, second.Cv], axis=-1)
-    shape = grid.count[:2]
-    h = problem.safety.evaluate(rest).h.min(-1)
-    a_0 = -rest.Minv @ bias
-    return Tables(h.reshape(shape), rest.Minv.reshape(*shape, 2, 2), a_0.reshape(*shape, 2, 4), model.u_max)
+    wide = [x[0] + (x[1] - x[0]) * np.arange(-GHOSTS, len(x) + GHOSTS) for x in axes]
+    q = model.from_angles(_pairs(wide))
+    h = problem.safety.evaluate(model.evaluate_batch(q, np.zeros((len(q), 2)))).h.min(-1)
+    shape, a_0 = grid.count[:2], -rest.Minv @ bias
+    return Tables(h.reshape(len(wide[0]), len(wide[1])), rest.Minv.reshape(*shape, 2, 2),
+                  a_0.reshape(*shape, 2, 4), model.u_max)  # fmt: skip
+
+
+def _pairs(axes: list[Array]) -> Array:
+    """All nodes (n1 n2, 2) of two axes."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
 
 
 def _digest(grid: Nodes, tables: Tables) -> str:
     """Name of the result: everything that it follows from."""
-    settings = (VERSION, CFL, TOLERANCE, grid.count, grid.periodic)
+    settings = (VERSION, CFL, TOLERANCE, NEAR, grid.count, grid.periodic)
     return hashlib.sha256(
         repr(settings).encode() + b"".join(np.ascontiguousarray(x).tobytes() for x in (grid.low, grid.high, *tables))
     ).hexdigest()
@@ -130,7 +142,7 @@ def _digest(grid: Nodes, tables: Tables) -> str:
 class _Fields(NamedTuple):
     """The same on the whole grid, as jax arrays (n1, n2, n3, n4, ...); axes that do not matter have length 1."""
 
-    h: Any
+    h: Any  # with its ghosts
     x_rate: Any  # (..., 4): velocity, and acceleration without torque
     Minv: Any  # (..., 2, 2)
     u_max: Any
@@ -138,59 +150,59 @@ class _Fields(NamedTuple):
 
 
 def _fields(grid: Nodes, tables: Tables) -> _Fields:
-    t = Tables(*(jnp.asarray(x, jnp.float32) for x in tables))
+    h, Minv, a_0, u_max = (jnp.asarray(x, jnp.float32) for x in tables)
     v1, v2 = (jnp.asarray(x, jnp.float32) for x in grid.axes[2:])
     v1, v2 = jnp.meshgrid(v1, v2, indexing="ij")
     powers = jnp.stack([jnp.ones_like(v1), v1 * v1, v1 * v2, v2 * v2], -1)
-    a_0 = jnp.einsum("abik,cdk->abcdi", t.a_0, powers)
+    a_0 = jnp.einsum("abik,cdk->abcdi", a_0, powers)
     velocity = jnp.broadcast_to(jnp.stack([v1, v2], -1), a_0.shape)
-    reach = jnp.abs(t.Minv) @ t.u_max
+    reach = jnp.abs(Minv) @ u_max
     speed = jnp.concatenate([jnp.abs(velocity), jnp.abs(a_0) + reach[:, :, None, None]], -1)
     rate = jnp.concatenate([velocity, a_0], -1)
-    return _Fields(t.h[:, :, None, None], rate, t.Minv[:, :, None, None], t.u_max, speed)
+    return _Fields(h[:, :, None, None], rate, Minv[:, :, None, None], u_max, speed)
 
 
-def _hold(values: Any, width: int) -> Any:
-    """Values beyond the edge: the edge's."""
-    return jnp.pad(values, (width, width), "edge")
-
-
-def _hj_grid(grid: Nodes) -> hj.Grid:
-    edges = tuple(hj.boundary_conditions.periodic if p else _hold for p in grid.periodic)
-    return hj.Grid.from_lattice_parameters_and_boundary_conditions(
-        hj.sets.Box(grid.low, grid.high), grid.count, boundary_conditions=edges
-    )
+def _slopes(grid: Nodes, loss: Any, h: Any) -> tuple[Any, Any]:
+    """∂V/∂x (n1, n2, n3, n4, 4) from the left and from the right, of ``V = h + loss``."""
+    sides = []
+    for i, axis in enumerate(grid.axes):
+        width = [(GHOSTS, GHOSTS) if j == i else (0, 0) for j in range(4)]
+        V = jnp.pad(loss, width, "wrap" if grid.periodic[i] else "edge")
+        V = V + h[slice(None) if i == 0 else INNER, slice(None) if i == 1 else INNER]
+        slopes = functools.partial(WENO3, spacing=axis[1] - axis[0], boundary_condition=lambda values, _: values)
+        sides.append(hj.utils.multivmap(slopes, np.array([j for j in range(4) if j != i]))(V))
+    left, right = zip(*sides, strict=True)
+    return jnp.stack(left, -1), jnp.stack(right, -1)
 
 
 def _settle(grid: Nodes, tables: Tables, on_sweeps: OnSweeps | None) -> tuple[Any, int]:
     """V - h (of grid.count) when V no longer changes, and the number of sweeps."""
-    lattice, fields = _hj_grid(grid), _fields(grid, tables)
-    spacing = jnp.asarray(lattice.spacings)
+    spacing = np.array([x[1] - x[0] for x in grid.axes], dtype=np.float32)
 
-    def v_rate(V: Any, f: _Fields) -> Any:
+    def rate(loss: Any, f: _Fields) -> Any:
         """max_u dV/dt with Lax-Friedrichs dissipation, (n1, n2, n3, n4)."""
-        left, right = lattice.upwind_grad_values(hj.finite_differences.upwind_first.WENO3, V)
+        left, right = _slopes(grid, loss, f.h)
         slope = (left + right) / 2.0
         push = (jnp.abs((f.Minv * slope[..., None, 2:]).sum(-1)) * f.u_max).sum(-1)
         return (slope * f.x_rate).sum(-1) + push + ((right - left) * f.speed).sum(-1) / 2.0
 
     @jax.jit
-    def sweep(V: Any, f: _Fields) -> tuple[Any, Any]:
+    def sweep(loss: Any, f: _Fields) -> tuple[Any, Any]:
         step = CFL / (f.speed / spacing).sum(-1)
 
         def once(_: int, state: tuple[Any, Any]) -> tuple[Any, Any]:
-            V = state[0]
-            V1 = V + step * v_rate(V, f)
-            new = jnp.minimum((V + V1 + step * v_rate(V1, f)) / 2.0, f.h)
-            return new, jnp.abs(new - V).max()
+            old = state[0]
+            once_on = old + step * rate(old, f)
+            new = jnp.minimum((old + once_on + step * rate(once_on, f)) / 2.0, 0.0)
+            return new, jnp.where(new + f.h[INNER, INNER] >= -NEAR, jnp.abs(old - new), 0.0).max()
 
-        return jax.lax.fori_loop(0, SWEEPS, once, (V, jnp.float32(0.0)))  # type: ignore[no-any-return]
+        return jax.lax.fori_loop(0, SWEEPS, once, (loss, jnp.float32(0.0)))  # type: ignore[no-any-return]
 
-    V = jnp.broadcast_to(fields.h, grid.count)
+    fields, loss = _fields(grid, tables), jnp.zeros(grid.count, jnp.float32)
     for done in range(SWEEPS, MAX_SWEEPS + 1, SWEEPS):
-        V, change = sweep(V, fields)
+        loss, change = sweep(loss, fields)
         if on_sweeps is not None:
             on_sweeps(done, float(change))
         if change <= TOLERANCE:
-            return np.minimum(np.asarray(V - fields.h), np.float32(0.0)), done
+            return np.asarray(loss), done
     raise CheckFailed(f"the viable set has not settled after {MAX_SWEEPS} sweeps: V still changes by {change:.2g} m")
