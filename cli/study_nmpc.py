@@ -32,7 +32,7 @@ def nmpc(
     dt: Annotated[float, typer.Option(min=1e-3, max=1.0, help="Seconds per step.")] = 0.025,
     iterations: Annotated[int, typer.Option(min=1, help="Iterations of IPOPT that a state is given.")] = 50,
     viable: ViableOption = True,
-    nodes: NodesOption = 31,
+    nodes: NodesOption = 41,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     json: JsonOption = False,
 ) -> None:

@@ -37,7 +37,7 @@ def safe_set(
     samples: Annotated[int, typer.Option(min=100, help="Uniform states of X for the volumes.")] = 20_000,
     boundary: Annotated[int, typer.Option(min=1, help="Boundary states of every set for the QP.")] = 1000,
     viable: ViableOption = True,
-    nodes: NodesOption = 31,
+    nodes: NodesOption = 41,
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1)] = 0,
     json: JsonOption = False,
 ) -> None:

@@ -39,7 +39,8 @@ from ppcbf_robots.specs import Array
 from ppcbf_robots.viable_set import Nodes, ViableSet, keep, recall
 
 VERSION = 1  # of the method: another one finds nothing in the cache
-NODES = 31  # per axis
+NODES = 41  # per axis
+LEAST_NODES = 7
 BEYOND_Q = 0.2  # of X's width, by which the grid reaches beyond X on either side
 BEYOND_V = 1.0
 CFL = 0.8
@@ -50,6 +51,8 @@ MAX_SWEEPS = 3000
 
 GHOSTS = 2  # nodes beyond an edge that WENO3 looks at
 INNER = slice(GHOSTS, -GHOSTS)
+
+ALIKE = 1e-9
 
 OnSweeps = Callable[[int, float], None]
 
@@ -65,7 +68,7 @@ class Tables(NamedTuple):
 
 def solve(
     problem: Problem,
-    nodes: int | tuple[int, int, int, int] = NODES,
+    nodes: int = NODES,
     beyond_v: float = BEYOND_V,
     on_sweeps: OnSweeps | None = None,
 ) -> ViableSet:
@@ -73,7 +76,7 @@ def solve(
 
     Args:
         problem: a robot with two moving joints in its world.
-        nodes: nodes per axis, or of each axis (q1, q2, v1, v2).
+        nodes: nodes per axis; along a joint that V - h does not depend on, as a cart before a wall, seven do.
         beyond_v: how far the grid reaches beyond X in v on either side, as a share of X's width.
         on_sweeps: called every few sweeps with their number and the largest change of V in the last one [m].
 
@@ -83,13 +86,15 @@ def solve(
     """
     if problem.model.nv != 2:
         raise InputError(f"a viable set needs a robot with 2 moving joints, this one has {problem.model.nv}")
-    count = (nodes,) * 4 if isinstance(nodes, int) else nodes
-    if min(count) < 7:
-        raise InputError(f"a viable set needs at least 7 nodes per axis, got {min(count)}")
-    grid = place_nodes(problem, count, beyond_v)
+    if nodes < LEAST_NODES:
+        raise InputError(f"a viable set needs at least {LEAST_NODES} nodes per axis, got {nodes}")
+    grid = place_nodes(problem, (nodes,) * 4, beyond_v)
+    tables = tabulate(problem, grid)
+    needed = [LEAST_NODES if _alike(tables, i) else nodes for i in (0, 1)]
+    grid = place_nodes(problem, (needed[0], needed[1], nodes, nodes), beyond_v)
     tables = tabulate(problem, grid)
     key = _digest(grid, tables)
-    found = recall(key, count) or _settle(grid, tables, on_sweeps)
+    found = recall(key, grid.count) or _settle(grid, tables, on_sweeps)
     keep(key, *found)
     return ViableSet(problem.safety, grid, *found)
 
@@ -129,6 +134,12 @@ def tabulate(problem: Problem, grid: Nodes) -> Tables:
 def _pairs(axes: list[Array]) -> Array:
     """All nodes (n1 n2, 2) of two axes."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+
+
+def _alike(tables: Tables, joint: int) -> bool:
+    """Whether V - h is the same all along a joint: dynamics are, and h falls or rises evenly."""
+    spread = [np.ptp(x, axis=joint).max() for x in (tables.Minv, tables.a_0)]
+    return bool(max(*spread, np.ptp(np.diff(tables.h, axis=joint))) < ALIKE)
 
 
 def _digest(grid: Nodes, tables: Tables) -> str:

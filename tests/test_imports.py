@@ -23,29 +23,33 @@ LAYERS = [
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["filters"],
     ["safety_filter", "problem"],
-    ["rollout", "artefact", "evidence", "engine_mujoco"],
-    ["benchmark"],
+    ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],
+    ["benchmark", "viability", "safe_sets", "nmpc"],
     ["learning"],
-    ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
+    ["export", "export_c", "plots", "plots_study", "viewer", "viewer_page", "viewer_shapes"],
     ["cli"],
 ]
 """From the bottom up; world_files, learning and cli are packages. A module imports from lower layers and its own."""
 
 OWNERS = {
     "numba": ["kernels"],
-    "scipy": ["shapes", "body_fit"],
+    "scipy": ["shapes", "body_fit", "viable_set"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
-    "matplotlib": ["plots"],
+    "matplotlib": ["plots", "plots_study"],
     "mujoco": ["engine_mujoco"],
+    "hj_reachability": ["viability"],
+    "jax": ["viability"],
+    "casadi": ["symbolic", "nmpc"],
+    "joblib": ["cli"],
     "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
     "torch": ["learning", "export", "cli"],
 }
-LAZY = {"torch": ["export", "cli"]}  # there only inside functions
+LAZY = {"torch": ["export", "cli"], "joblib": ["cli"]}  # there only inside functions
 
 PACKAGE = "ppcbf_robots"
 ROOT = Path(__file__).parent.parent
@@ -129,7 +133,7 @@ def test_libraries_stay_with_their_owners(library):
 
 @pytest.mark.parametrize("module", ["safety_filter", "rollout", "artefact", "problem", "cli.main"])
 def test_the_runtime_starts_without_heavy_libraries(module):
-    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco"]
+    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco", "hj_reachability", "casadi", "joblib"]
     code = f"import sys, {PACKAGE}.{module}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

@@ -24,13 +24,13 @@ WALL = 1.5
 def gantry(cache_folder: Path) -> tuple[Problem, ViableSet]:
     """Two slides in front of the wall x = 1.5: 6 N move 3 kg along x, so the best it can brake with is 2 m/s²."""
     problem = load_problem(str(DATA / "gantry.yaml"), "wall")
-    return problem, viability.solve(problem, (31, 7, 41, 7))
+    return problem, viability.solve(problem, 41)
 
 
 @pytest.fixture(scope="session")
 def pole(problems: dict[str, Problem]) -> tuple[Problem, ViableSet]:
     """The paper's cart-pole on a coarse grid."""
-    return problems["cartpole"], viability.solve(problems["cartpole"], 15)
+    return problems["cartpole"], viability.solve(problems["cartpole"], 31)
 
 
 def uniform(problem: Problem, count: int, seed: int = 0) -> tuple[Array, Array]:
@@ -101,7 +101,7 @@ def test_from_outside_no_constant_torque_avoids_the_wall(pole):
     problem, found = pole
     model = problem.model
     q, v = uniform(problem, 4000, 1)
-    lost = np.flatnonzero(found.value(q, v) < -0.03)[:15]
+    lost = np.flatnonzero(found.value(q, v) < -0.06)[:15]
     assert len(lost) == 15
     for i in lost:
         for pull in (-1.0, 0.0, 1.0, np.nan):  # of the pole; nan: whatever brakes the cart
@@ -115,10 +115,10 @@ def test_from_outside_no_constant_torque_avoids_the_wall(pole):
 
 
 def test_a_finer_grid_changes_the_volume_by_less_than_two_percent(pole):
-    problem, coarse = pole
-    fine = viability.solve(problem, 21)
+    problem, found = pole
+    coarser = viability.solve(problem, 23)
     q, v = uniform(problem, 5000)
-    volumes = [s.contains(q, v).mean() for s in (coarse, fine)]
+    volumes = [s.contains(q, v).mean() for s in (coarser, found)]
     assert volumes[0] == pytest.approx(volumes[1], rel=0.02)
     assert 0.9 < volumes[1] < 0.97
 
@@ -147,7 +147,7 @@ def test_tables_give_pinocchio_s_acceleration(two_link):
 def test_results_are_kept_and_altered_ones_are_not_used(gantry, cache_folder, monkeypatch):
     problem, found = gantry
     monkeypatch.setattr(viability, "_settle", lambda *_: pytest.fail("computed again"))
-    again = viability.solve(problem, (31, 7, 41, 7))
+    again = viability.solve(problem, 41)
     np.testing.assert_array_equal(again.loss, found.loss)
     assert again.sweeps == found.sweeps
     key = viability._digest(found.nodes, viability.tabulate(problem, found.nodes))
