@@ -15,7 +15,7 @@ from ppcbf_robots.cli.output import JsonOption, emit_json, err, out, table
 from ppcbf_robots.cli.study_safe_set import LB, PP, NodesOption, ViableOption, trained, viable_set, write_csv
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
-from ppcbf_robots.safe_sets import Mask, sets_at
+from ppcbf_robots.safe_sets import Mask, levels_at
 from ppcbf_robots.specs import Array, vector
 
 Point = dict[str, Any]
@@ -69,12 +69,13 @@ def nmpc(
                              strict=True)
     ]  # fmt: skip
     found = np.array([p["safe"] for p in points])
-    sets = sets_at(problem, barriers, reference, q, np.tile(v, (len(q), 1)))
+    levels = levels_at(problem, barriers, reference, q, np.tile(v, (len(q), 1)))
+    sets = {name: level >= 0.0 for name, level in levels.items()}
     rows = overlaps(found, sets)
     files = [str(out_dir / name) for name in ("points.csv", "overlaps.csv", "nmpc.png")]
     write_csv(Path(files[0]), _flat(problem, points, sets))
     write_csv(Path(files[1]), rows)
-    square = {name: mask.reshape(grid, grid) for name, mask in sets.items()}
+    square = {name: level.reshape(grid, grid) for name, level in levels.items()}
     plot_nmpc(problem, x, y, square, found.reshape(grid, grid), v, Path(files[2]))
     if json:
         emit_json({"points": len(points), "safe": int(found.sum()), "rows": rows, "files": files})

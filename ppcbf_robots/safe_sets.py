@@ -61,23 +61,23 @@ def membership(
     domain, parts = problem.robot.domain, []
     for n in _chunks(count):
         q = problem.model.from_angles(domain.sample_q(rng, n))
-        parts.append(sets_at(problem, barriers, viable, q, domain.sample_v(rng, n)))
-    return Membership({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+        parts.append(levels_at(problem, barriers, viable, q, domain.sample_v(rng, n)))
+    return Membership({name: np.concatenate([part[name] for part in parts]) >= 0.0 for name in parts[0]})
 
 
-def sets_at(
+def levels_at(
     problem: Problem, barriers: Mapping[str, Barrier], viable: ViableSet | None, q: Array, v: Array
-) -> dict[str, Mask]:
-    """Which states q (B, nq), v (B, nv) lie in which set, (B,) by name."""
+) -> dict[str, Array]:
+    """By set, the least of h and phi at the states q (B, nq), v (B, nv): (B,), not negative inside."""
     dyn = problem.model.evaluate_batch(q, v)
     safety = problem.safety.evaluate(dyn)
     h = safety.h.min(axis=-1)
-    inside = {FREE: h >= 0.0}
+    levels = {FREE: h}
     if viable is not None:
-        inside[VIABLE] = viable.value_from(h, q, v) >= 0.0
+        levels[VIABLE] = viable.value_from(h, q, v)
     for name, barrier in barriers.items():
-        inside[name] = inside[FREE] & (barrier.rows(dyn, safety).phi.min(axis=-1) >= 0.0)
-    return inside
+        levels[name] = np.minimum(h, barrier.rows(dyn, safety).phi.min(axis=-1))
+    return levels
 
 
 @dataclass(frozen=True)
