@@ -20,6 +20,8 @@ SMALLER = {
     "simulate": ["--duration", "0.2"],
     "bench": ["--steps", "100"],
     "compare": ["--iterations", "30", "--duration", "0.3"],
+    "study safe-set": ["--samples", "200", "--boundary", "10", "--nodes", "9"],
+    "study nmpc": ["--grid", "3", "--steps", "10", "--nodes", "9"],
 }
 
 
@@ -34,22 +36,29 @@ def commands() -> list[list[str]]:
     return [w[1:] for w in words if w and Path(w[0]).name == "ppcbf"]
 
 
+def name(arguments: list[str]) -> str:
+    """A command's name, with that of its subcommand."""
+    return " ".join(arguments[: 2 if arguments[0] == "study" else 1])
+
+
 def test_the_readme_names_every_command() -> None:
-    assert {c[0] for c in commands()} == {"info", "train", "simulate", "view", "export", "compare", "convert", "bench"}
+    assert {name(c) for c in commands()} == {
+        "info", "train", "simulate", "view", "export", "compare", "convert", "bench", "study safe-set", "study nmpc"
+    }  # fmt: skip
 
 
 @pytest.mark.slow
 def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for arguments in commands():
-        monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(arguments[0], [])])
+        monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(name(arguments), [])])
         with pytest.raises(SystemExit) as exit_info:
             main()
         allowed = {0, 3} if arguments[0] in ("train", "compare") else {0}  # reduced training may not converge
         assert exit_info.value.code in allowed, arguments
-        for name in ("--out", "--html"):
-            if name in arguments:
-                assert Path(arguments[arguments.index(name) + 1]).exists(), arguments
+        for option in ("--out", "--html"):
+            if option in arguments:
+                assert Path(arguments[arguments.index(option) + 1]).exists(), arguments
     names: dict[str, object] = {}  # each block goes on from the one before
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), names)
