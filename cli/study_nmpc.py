@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +12,7 @@ import typer
 from rich.progress import track
 
 from ppcbf_robots.cli.extras import needs
-from ppcbf_robots.cli.output import JsonOption, emit_json, err, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, table
 from ppcbf_robots.cli.study_safe_set import LB, PP, NodesOption, ViableOption, trained, viable_set, write_csv
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
@@ -22,9 +23,9 @@ Point = dict[str, Any]
 
 
 def nmpc(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="As for the other commands.")] = "cartpole",
-    obstacles: Annotated[str, typer.Argument(metavar="OBSTACLES", help="Spheres and half-spaces.")] = "wall",
-    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for figure and tables.")] = Path("nmpc"),
+    robot: RobotArgument,
+    obstacles: WorldArgument,
+    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for figure and tables.")],
     barrier: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Trained barrier; may be repeated.")] = None,
     velocity: Annotated[str, typer.Option(metavar="V,...", help="Initial velocity.")] = "0.5,0.5",
     grid: Annotated[int, typer.Option(min=2, max=501, help="Initial states per axis, over X in q.")] = 41,
@@ -39,15 +40,11 @@ def nmpc(
     """Solve a predictive controller's problem from a grid of configurations and compare with the safe sets (Fig. 6).
 
     A state counts as safe for the NMPC if IPOPT finds a trajectory of N steps within torque limits, joint limits and
-    clear of the obstacles. The paper leaves the cost open; here it is the distance to the robot's goal, its speed and
-    a little of its torque. The last lines say how the NMPC's answer and each safe set overlap.
+    clear of the obstacles, which may be spheres and half-spaces. The paper leaves the cost open; here it is the
+    distance to the robot's goal, its speed and a little of its torque.
 
     Example: ppcbf study nmpc cartpole wall --out runs/nmpc --jobs 2
     """
-    with needs("study", "the predictive controller"):
-        from joblib import Parallel, delayed
-
-        from ppcbf_robots.nmpc import Settings, judge, planner
     problem = load_problem(robot, obstacles)
     if problem.model.nv < 2:
         raise InputError("the study is over the first two joints, this robot has one")
@@ -57,23 +54,15 @@ def nmpc(
 
     q = slice_states(problem, x, y)
     barriers = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")} | trained(problem, barrier or [])
-    settings = Settings(steps, dt, iterations)
-    planner(robot, obstacles, settings)  # bad input ends here, not in a worker
+    tasks = planning_tasks(robot, obstacles, (steps, dt, iterations), problem.model.to_angles(q), v)
     reference = viable_set(problem, nodes) if viable and problem.model.nv == 2 else None
-    angles = problem.model.to_angles(q)
-    tasks = [partial(judge, robot, obstacles, settings, tuple(a), tuple(v)) for a in angles.tolist()]
-    answers = Parallel(n_jobs=jobs, return_as="generator")(delayed(task)() for task in tasks)
-    points: list[Point] = [
-        {"q": a, **answer}
-        for a, answer in zip(angles.tolist(), track(answers, "planning", len(tasks), console=err, transient=True),
-                             strict=True)
-    ]  # fmt: skip
+    points = _run(tasks, jobs)
     found = np.array([p["safe"] for p in points])
     levels = levels_at(problem, barriers, reference, q, np.tile(v, (len(q), 1)))
     sets = {name: level >= 0.0 for name, level in levels.items()}
     rows = overlaps(found, sets)
     files = [str(out_dir / name) for name in ("points.csv", "overlaps.csv", "nmpc.png")]
-    write_csv(Path(files[0]), _flat(problem, points, sets))
+    write_csv(Path(files[0]), _flat(problem, q, points, sets))
     write_csv(Path(files[1]), rows)
     square = {name: level.reshape(grid, grid) for name, level in levels.items()}
     plot_nmpc(problem, x, y, square, found.reshape(grid, grid), v, Path(files[2]))
@@ -82,6 +71,28 @@ def nmpc(
     else:
         _print(problem, v, found, rows)
         out.print("wrote " + ", ".join(files))
+
+
+def planning_tasks(
+    robot: str, obstacles: str, settings: tuple[int, float, int], angles: Array, v: Array
+) -> list[Callable[[], Point]]:
+    """One task per configuration (n, nv) at velocity v (nv,), each to be sent to a worker process.
+
+    ``settings`` are N, dt and the iterations. Raises InputError for a world that the planner does not know.
+    """
+    with needs("study", "the predictive controller"):
+        from ppcbf_robots.nmpc import Settings, judge, planner
+    chosen = Settings(*settings)
+    planner(robot, obstacles, chosen)  # bad input ends here, not in a worker
+    return [partial(judge, robot, obstacles, chosen, tuple(a), tuple(v.tolist())) for a in angles.tolist()]
+
+
+def _run(tasks: list[Callable[[], Point]], jobs: int) -> list[Point]:
+    """The tasks' answers in their order, with a progress bar."""
+    from joblib import Parallel, delayed
+
+    answers = Parallel(n_jobs=jobs, return_as="generator")(delayed(task)() for task in tasks)
+    return list(track(answers, "planning", len(tasks), console=err, transient=True))
 
 
 def overlaps(found: Mask, sets: dict[str, Mask]) -> list[dict[str, Any]]:
@@ -98,13 +109,13 @@ def overlaps(found: Mask, sets: dict[str, Mask]) -> list[dict[str, Any]]:
     return rows
 
 
-def _flat(problem: Problem, points: list[Point], sets: dict[str, Mask]) -> list[dict[str, Any]]:
-    names = problem.model.joint_names
+def _flat(problem: Problem, q: Array, points: list[Point], sets: dict[str, Mask]) -> list[dict[str, Any]]:
+    """One row per initial state: its angles, the NMPC's answer, and which sets it lies in."""
+    names, angles = problem.model.joint_names, problem.model.to_angles(q).tolist()
     return [
-        dict(zip(names, p["q"], strict=True)) | {k: p[k] for k in ("safe", "status", "iterations")}
-        | {name: bool(mask[i]) for name, mask in sets.items()}
+        dict(zip(names, angles[i], strict=True)) | p | {name: bool(mask[i]) for name, mask in sets.items()}
         for i, p in enumerate(points)
-    ]  # fmt: skip
+    ]
 
 
 def _print(problem: Problem, v: Array, found: Mask, rows: list[dict[str, Any]]) -> None:

@@ -59,7 +59,6 @@ class ViableSet:
 
     def value(self, q: Array, v: Array) -> Array:
         """Least h that remains at best [m], (...), at q (..., nq) and v (..., nv); NaN beyond the grid."""
-        q, v = np.broadcast_arrays(*np.atleast_2d(q, v)) if np.ndim(q) != np.ndim(v) else (np.asarray(q), np.asarray(v))
         lead, robot = v.shape[:-1], self.safety.robot
         dyn = robot.evaluate_batch(q.reshape(-1, robot.nq), np.zeros((int(np.prod(lead, dtype=int)), robot.nv)))
         return self.value_from(self.safety.evaluate(dyn).h.min(-1).reshape(lead), q, v)
