@@ -118,7 +118,7 @@ def test_every_obstacle_casts_a_shadow_in_plots(tmp_path: Path, monkeypatch: pyt
     problem = dataclasses.replace(problem, world=load_world(DATA / "ours.yaml"))
     run = simulate(problem.safety, problem.robot.controller, None, problem.robot.start, np.zeros(2), 0.05)
     figures: list[Any] = []
-    monkeypatch.setattr(plots, "_save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(plots, "save", lambda figure, path: figures.append(figure))
     plots.plot_paths(problem, {"free": run}, tmp_path / "paths.png")
     solids = [o for o in problem.world.obstacles if not isinstance(o, HalfSpace)]
     for ax, k in zip(figures[0].axes, (2, 1), strict=True):
