@@ -39,7 +39,8 @@ class SafetyRows:
 class SafetyFunction:
     """All rows h_k of a robot in a world.
 
-    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, joint by joint.
+    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, joint by joint. ``limits`` holds
+    (joint, sign, bound) of the joint limits among the rows: ``h = sign (q - bound)``.
 
     Args:
         robot: the robot.
@@ -74,15 +75,15 @@ class SafetyFunction:
         self.points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
         self._radii = np.array([s.radius for s in body])
         self._self_pairs = np.array(self_pairs, dtype=np.int64).reshape(-1, 2)
-        limits = self._limit_rows(joint_limits, domain)
-        self._limit_joint = np.array([i for i, _, _ in limits], dtype=np.int64)
-        self._limit_sign = np.array([s for _, s, _ in limits])
-        self._limit_bound = np.array([b for _, _, b in limits])
+        self.limits = self._limit_rows(joint_limits, domain)
+        self._limit_joint = np.array([i for i, _, _ in self.limits], dtype=np.int64)
+        self._limit_sign = np.array([s for _, s, _ in self.limits])
+        self._limit_bound = np.array([b for _, _, b in self.limits])
         labels = [f"{s.frame}#{i}" for i, s in enumerate(body)]
         self.names = [f"{b} / {o.name}" for b in labels for o in self.obstacles]
         self.names += [f"{labels[a]} / {labels[b]}" for a, b in self._self_pairs]
         self.pairs = len(self.names)
-        self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in limits]
+        self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in self.limits]
         self.rows = len(self.names)
         self.v_domain = np.zeros((0, 2)) if v_domain is None else v_domain
         guarded = robot.joint_names[: len(self.v_domain)]

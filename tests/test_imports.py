@@ -25,10 +25,10 @@ LAYERS = [
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["filters"],
     ["safety_filter", "problem"],
-    ["rollout", "artefact", "evidence", "engine_mujoco"],
-    ["benchmark"],
+    ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],
+    ["benchmark", "viability", "safe_sets", "nmpc"],
     ["learning"],
-    ["export", "export_c", "plots", "viewer", "viewer_page", "viewer_shapes"],
+    ["export", "export_c", "plots", "plots_study", "viewer", "viewer_page", "viewer_shapes"],
     ["studies"],
     ["cli"],
 ]
@@ -36,24 +36,27 @@ LAYERS = [
 
 OWNERS = {
     "numba": ["kernels"],
-    "scipy": ["shapes", "body_fit", "ending"],
+    "scipy": ["shapes", "body_fit", "ending", "viable_set"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
-    "matplotlib": ["plots", "studies.figures"],
+    "matplotlib": ["plots", "plots_study", "studies.figures"],
     "mujoco": ["engine_mujoco"],
+    "hj_reachability": ["viability"],
+    "jax": ["viability"],
+    "casadi": ["symbolic", "nmpc"],
     "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
     "torch": ["learning", "export", "studies", "cli"],
-    "joblib": ["sweep"],
+    "joblib": ["sweep", "cli"],
     "distributed": ["sweep"],
 }
 LAZY = {
     "torch": ["export", "studies", "cli"],
     "distributed": ["sweep"],
-    "joblib": ["sweep"],
+    "joblib": ["sweep", "cli"],
 }  # there only inside functions
 
 PACKAGE = "ppcbf_robots"
@@ -139,7 +142,7 @@ def test_libraries_stay_with_their_owners(library):
 
 @pytest.mark.parametrize("module", ["safety_filter", "rollout", "artefact", "problem", "cli.main"])
 def test_the_runtime_starts_without_heavy_libraries(module):
-    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco", "joblib", "distributed"]
+    heavy = ["torch", "meshcat", "matplotlib", "onnx", "mujoco", "hj_reachability", "casadi", "joblib", "distributed"]
     code = f"import sys, {PACKAGE}.{module}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

@@ -23,6 +23,8 @@ SMALLER = {
     "sweep": ["--robots", "two_link", "--worlds", "circle", "--seeds", "0", "--iterations", "10"],
     "study convergence": ["--runs", "1", "--rates", "1e-4", "--preset", "default", "--iterations", "10"],
     "study variability": ["--seeds", "0", "--iterations", "10"],
+    "study safe-set": ["--samples", "200", "--boundary", "10", "--nodes", "9"],
+    "study nmpc": ["--grid", "3", "--steps", "10", "--nodes", "9"],
 }
 
 
@@ -44,7 +46,8 @@ def name_of(arguments: list[str]) -> str:
 
 def test_the_readme_names_every_command() -> None:
     one = {"info", "train", "simulate", "view", "export", "compare", "convert", "bench", "sweep"}
-    assert {name_of(c) for c in commands()} == one | {"study convergence", "study variability"}
+    studies = {f"study {name}" for name in ("convergence", "variability", "safe-set", "nmpc")}
+    assert {name_of(c) for c in commands()} == one | studies
 
 
 @pytest.mark.slow
@@ -56,9 +59,9 @@ def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pyt
             main()
         allowed = {0, 3} if arguments[0] in ("train", "compare", "sweep") else {0}  # reduced training may not converge
         assert exit_info.value.code in allowed, arguments
-        for name in ("--out", "--html"):
-            if name in arguments:
-                assert Path(arguments[arguments.index(name) + 1]).exists(), arguments
+        for option in ("--out", "--html"):
+            if option in arguments:
+                assert Path(arguments[arguments.index(option) + 1]).exists(), arguments
     names: dict[str, object] = {}  # each block goes on from the one before
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), names)

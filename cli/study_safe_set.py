@@ -1,0 +1,149 @@
+"""``ppcbf study safe-set``: how large the safe sets are, beside one another and the viable set."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.progress import Progress
+
+from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.cli.extras import needs
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, table
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.problem import Problem, load_problem, parse_vector
+from ppcbf_robots.safe_sets import FREE, VIABLE, Membership, check_boundary, membership
+from ppcbf_robots.specs import Array, vector
+from ppcbf_robots.viable_set import ViableSet
+
+LB, PP = "LB-CBF", "PP-CBF"
+NodesOption = Annotated[int, typer.Option(min=7, max=101, help="Nodes per axis of the viable set's grid.")]
+ViableOption = Annotated[bool, typer.Option(help="The viable set too, where the robot has 2 joints.")]
+
+
+def safe_set(
+    robot: RobotArgument,
+    obstacles: WorldArgument,
+    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for figure and table.")],
+    barrier: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Trained barrier; may be repeated.")] = None,
+    velocity: Annotated[
+        list[str] | None, typer.Option(metavar="V,...", help="Velocity of a slice; may be repeated.")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=100, help="Uniform states of X for the volumes.")] = 20_000,
+    boundary: Annotated[int, typer.Option(min=1, help="Boundary states of every set for the QP.")] = 1000,
+    viable: ViableOption = True,
+    nodes: NodesOption = 41,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1)] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Volumes and slices of the safe sets of LB-CBF, PP-CBF, trained barriers and the viable set (Fig. 7 of the paper).
+
+    Volumes are shares of the same uniform states of X. "Not viable" is the share of a set from which no torque within
+    the limits avoids a collision; "infeasible" the share of states at a set's boundary where no torque within the
+    limits satisfies its rows.
+
+    Example: ppcbf study safe-set cartpole wall --barrier runs/cartpole --out runs/sets
+    """
+    problem = load_problem(robot, obstacles)
+    velocities = _velocities(problem, velocity)
+    barriers = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")} | trained(problem, barrier or [])
+    reference = viable_set(problem, nodes) if viable and problem.model.nv == 2 else None
+    rng = np.random.default_rng(seed)
+    found = membership(problem, barriers, reference, samples, rng)
+    rows = [_row(found, name) for name in found.inside]
+    for row in rows:
+        known = barriers.get(row["set"])
+        check = None if known is None else check_boundary(problem, known, boundary, rng)
+        row |= {"infeasible": None if check is None else check.share, "boundary": 0 if check is None else check.samples}
+    files = [str(out_dir / "volumes.csv"), str(out_dir / "safe_set.png")]
+    write_csv(Path(files[0]), rows)
+    if problem.model.nv >= 2:
+        from ppcbf_robots.plots_study import plot_sets  # matplotlib only where it is needed
+
+        plot_sets(problem, barriers, reference, velocities, Path(files[1]))
+    else:
+        files.pop()
+    if json:
+        emit_json({"samples": samples, "rows": rows, "files": files})
+    else:
+        _print(problem, rows)
+        out.print("wrote " + ", ".join(files))
+
+
+def trained(problem: Problem, folders: list[str]) -> dict[str, Barrier]:
+    """Trained barriers by the names of their folders, refused where they belong to another problem."""
+    found: dict[str, Barrier] = {}
+    for folder in folders:
+        name = Path(folder).name
+        if name in found:
+            raise InputError(f"--barrier: two folders are named '{name}'; rename one")
+        found[name] = load_barrier(Path(folder)).barrier(problem)
+    return found
+
+
+def viable_set(problem: Problem, nodes: int) -> ViableSet:
+    """The viable set, with its progress on stderr."""
+    with needs("study", "the viable set"):
+        from ppcbf_robots import viability
+    with Progress(console=err, transient=True) as progress:
+        task = progress.add_task("viable set", total=None)
+        return viability.solve(problem, nodes, on_sweeps=_shown(progress, task))
+
+
+def _shown(progress: Progress, task: Any) -> Callable[[int, float], None]:
+    def show(sweeps: int, change: float) -> None:
+        progress.update(task, description=f"viable set: {sweeps} sweeps, V changes by {change:.1e} m")
+
+    return show
+
+
+def _velocities(problem: Problem, given: list[str] | None) -> list[Array]:
+    """Velocities of the slices: as given, else rest and 0.5, as the paper's figures, where X reaches that far."""
+    nv, v = problem.model.nv, problem.robot.domain.v
+    if not given:
+        return [np.zeros(nv), 0.5 * np.minimum(v[:, 1], 1.0)]
+    return [vector(parse_vector(text, "--velocity") or [], nv, "--velocity") for text in given]
+
+
+def _row(found: Membership, name: str) -> dict[str, Any]:
+    """Volume of a set relative to X and the references, each with its standard error."""
+    row: dict[str, Any] = {"set": name}
+    for key, reference in (("of_X", None), ("of_lb", LB), ("of_pp", PP), ("of_viable", VIABLE)):
+        known = reference is None or reference in found.inside
+        ratio = found.ratio(name, reference) if known else None
+        row |= {key: ratio and ratio.value, f"{key}_error": ratio and ratio.error}
+    row["not_viable"] = found.outside(name, VIABLE) if VIABLE in found.inside and name not in (FREE, VIABLE) else None
+    return row
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Rows with the keys of the first one as columns; InputError where it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _print(problem: Problem, rows: list[dict[str, Any]]) -> None:
+    columns = ["set", "of X", "of LB-CBF", "of PP-CBF", "of viable", "not viable", "infeasible"]
+    cells = [
+        [r["set"], *(_percent(r[k], r[f"{k}_error"]) for k in ("of_X", "of_lb", "of_pp", "of_viable")),
+         _percent(r["not_viable"]), _percent(r["infeasible"])]
+        for r in rows
+    ]  # fmt: skip
+    table(f"{problem.robot.name} in {problem.world_name}: volumes in X", columns, cells)
+
+
+def _percent(x: float | None, error: float | None = None) -> str:
+    if x is None or np.isnan(x):
+        return "-"
+    return f"{x:.1%}" if error is None else f"{100 * x:.1f} ± {100 * error:.1f} %"
