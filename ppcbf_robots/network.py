@@ -165,12 +165,13 @@ class NumpyNetwork:
         p = self.params
         layers = [(p[f"W{i}"], p[f"b{i}"]) for i in range(sum(f"W{i}" in p for i in range(len(p))))]
         weights = np.concatenate([np.zeros(0), *(x.ravel() for layer in layers for x in layer)])
-        widths = np.array([len(p["in_shift"]), *(len(b) for _, b in layers)])
+        inputs = len(p["in_shift"]) * (1 if self.kind == "mlp" else 3)
+        widths = np.array([inputs, *(len(b) for _, b in layers)])
         common = weights, widths, p["in_shift"], p["in_scale"]
         if self.kind == "mlp":
             return *common, p["w_out"], float(p["b_out"]), float(p["zero_at_rest"])
         heads = (np.ascontiguousarray(p[f"W{k}"].T) if w else p[f"b{k}"] for k in "abc" for w in (True, False))
-        return *common, p["v_scale"], *heads
+        return *common, p["turns"], p["v_scale"], *heads
 
 
 def random_convex(nq: int, nv: int, hidden: tuple[int, ...], units: int, rng: np.random.Generator) -> dict[str, Any]:
