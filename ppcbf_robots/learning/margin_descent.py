@@ -33,6 +33,8 @@ LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
 STRICTER = 1.3  # factor on the wanted margin per refinement
 MAX_MARGIN = 0.3
+SIMPLER = 3.0  # factor on the penalty of what depends on q, per refinement
+TAKEN = 300  # states at most that join from one search
 HUMBLER = 0.4  # factor on the largest weight of the volume per refinement
 
 
@@ -43,7 +45,7 @@ class MarginDescent(Descent):
         super().__init__(problem, kind, preset, seed, device)
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._first_pool = len(self.rays)
-        self._max_weight = preset.volume_weight
+        self._max_weight, self._simplicity = preset.volume_weight, preset.l2
         self._weight = torch.tensor(preset.volume_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
         self._look()
@@ -69,11 +71,13 @@ class MarginDescent(Descent):
         if len(short):
             wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short])[0])
             loss = loss + wanting.sum() / len(index) + p.worst_weight * wanting.mean()
+        heads = [self.params[k] for k in ("Wa", "Wb", "Wc")]
+        loss = loss + self._simplicity * sum(((w * w).sum() for w in heads), start=loss.new_zeros(()))
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.loss = loss.detach()
-        violated = (margin < 0.0).to(self.dtype).mean() > VIOLATED
+        violated = (margin[:drawn] < 0.0).to(self.dtype).mean() > VIOLATED
         factor = torch.where(violated, WEIGHT_FALL, WEIGHT_GROWTH)
         self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
 
@@ -89,10 +93,11 @@ class MarginDescent(Descent):
     def check(self) -> tuple[float, float, float]:
         """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
         found = self._explore()
+        self._look()
         attack = self.falsifier.search(self.params, rounds=self.preset.search_rounds, starts=self._starts())
         if len(attack.q):
-            self._join(self.rays_through(attack.q, attack.v))
-        self._look()
+            self.add_counterexamples(attack.q, attack.v)
+            self._look()
         with torch.no_grad():
             index, s, crosses = self.sample(CHECK_STATES)
             if not len(index):
@@ -165,12 +170,16 @@ class MarginDescent(Descent):
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""
+        if len(q) > TAKEN:
+            chosen = self.rng.choice(len(q), TAKEN, replace=False)
+            q, v = q[chosen], v[chosen]
         self._join(self.rays_through(q, v))
 
     def demand_more(self) -> None:
         """A larger margin is wanted, and volume weighs less."""
         self.margin = min(MAX_MARGIN, STRICTER * self.margin)
         self._max_weight *= HUMBLER
+        self._simplicity *= SIMPLER
         self._weight = self._weight.clamp(max=self._max_weight)
         self._look()
 
@@ -179,7 +188,7 @@ class MarginDescent(Descent):
         added = self.rays.select(slice(self._first_pool, None))
         tensors = {f"rays/{k}": x for k, x in vars(added).items()}
         tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
-        return tensors, {"margin": self.margin, "max_weight": self._max_weight}
+        return tensors, {"margin": self.margin, "max_weight": self._max_weight, "simplicity": self._simplicity}
 
     def restore(self, tensors: Tensors, numbers: dict[str, Any]) -> None:
         """See :meth:`state`."""
@@ -190,4 +199,4 @@ class MarginDescent(Descent):
         self._noted, self._weight, self._crossing, self._near = (
             tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")
         )
-        self.margin, self._max_weight = numbers["margin"], numbers["max_weight"]
+        self.margin, self._max_weight, self._simplicity = (numbers[k] for k in ("margin", "max_weight", "simplicity"))

@@ -25,7 +25,7 @@ class Preset:
     samples: int = 1000  # N, new band states per iteration
     epochs: int = 1  # closed form: E, gradient steps per iteration
     top: int = 100  # closed form: k of Top_k
-    l2: float = 0.0  # closed form: weight of the L2 penalty (mean square of the weights)
+    l2: float = 0.0  # weight of the L2 penalty; closed form: mean square of the weights, QP: square of the heads'
     volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: the largest weight of the volume
     worst_weight: float = 0.0  # QP: of the mean over violations, beside their sum over the batch
     critic_weight: float = 10.0  # closed form: initial λ of both constraints
@@ -79,6 +79,7 @@ DEFAULT = Preset(
     gamma=10.0,
     volume_weight=0.2,
     worst_weight=0.05,
+    l2=1e-4,
     random_goals=0.5,
     rays=60_000,
     iterations=1_000,
