@@ -20,7 +20,7 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 STARTS = 48  # searched from at once
-PROBES = 4_000  # random configurations, of which the worst become starts
+PROBES = 40  # random points for every start, of which the worst is taken
 FIRST_STEP = 0.02  # of X's width, of the finite differences
 LAST_STEP = 2e-4  # below which a start is given up and replaced
 STRIDES = (0.5, 2.0, 8.0)  # gradient steps tried, in units of the difference's step
@@ -98,7 +98,7 @@ class Falsifier:
 
     def _fresh(self, params: Mapping[str, torch.Tensor], count: int) -> Array:
         """The worst ``count`` of random points."""
-        points = self.rng.uniform(self._low, self._high, (PROBES, len(self._low)))
+        points = self.rng.uniform(self._low, self._high, (PROBES * count, len(self._low)))
         return points[np.argsort(self.margins(params, points)[0])[:count]]
 
     def _descend(

@@ -19,7 +19,6 @@ from ppcbf_robots.learning.falsifier import STARTS, Attack, Falsifier
 from ppcbf_robots.learning.parameters import Tensors
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
-from ppcbf_robots.network import value_and_grad
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
@@ -29,13 +28,13 @@ EXPLORED = 1_600  # new rays per check, around those of small margin
 SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
 POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
-LEAST_WEIGHT = 0.05  # of the largest
+LEAST_WEIGHT = 0.2  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.3  # factor on the wanted margin per refinement
+STRICTER = 1.15  # factor on the wanted margin per refinement
 MAX_MARGIN = 0.3
-SIMPLER = 3.0  # factor on the penalty of what depends on q, per refinement
+SIMPLER = 2.0  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
-HUMBLER = 0.4  # factor on the largest weight of the volume per refinement
+HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
 
 
 class MarginDescent(Descent):
@@ -66,13 +65,12 @@ class MarginDescent(Descent):
         with torch.no_grad():
             margin = self.band.margin(self.params, rays, s)[0]
             self._noted[index] = margin
-        loss = self._weight * self._shrinkage(rays.select(slice(drawn)), s[:drawn])
+        shrinkage, unrest = self._shrinkage(rays.select(slice(drawn)), s[:drawn])
+        loss = self._weight * shrinkage + self._simplicity * unrest
         short = (margin < self.margin).nonzero()[:, 0]  # the others have no gradient
         if len(short):
             wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short])[0])
             loss = loss + wanting.sum() / len(index) + p.worst_weight * wanting.mean()
-        heads = [self.params[k] for k in ("Wa", "Wb", "Wc")]
-        loss = loss + self._simplicity * sum(((w * w).sum() for w in heads), start=loss.new_zeros(()))
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
@@ -81,14 +79,17 @@ class MarginDescent(Descent):
         factor = torch.where(violated, WEIGHT_FALL, WEIGHT_GROWTH)
         self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
 
-    def _shrinkage(self, rays: Rays, s: torch.Tensor) -> torch.Tensor:
-        """Mean of -log s*, of the boundary's s* on each ray, up to a constant: its gradient is that of K / |d phi/d log s|."""
+    def _shrinkage(self, rays: Rays, s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean of -log s*, with the boundary's s* on each ray, and how much K changes along the motion, without dimensions.
+
+        The first is given up to a constant: its gradient is that of ``K / |∂phi/∂log s|``.
+        """
         v = s[:, None] * rays.d
-        K, _, K_v = value_and_grad(torch, self.preset.network, self.params, rays.q, v)
+        K, K_q_rate, K_v = self.band.field.K(self.params, rays.q, v)
         hdot = (rays.grad @ v[..., None])[..., 0]
         row = (hdot + self.band.field.gamma * rays.h).argmin(-1, keepdim=True)
-        slope = ((v * K_v).sum(-1) - hdot.gather(-1, row)[:, 0]).detach()
-        return (K / slope.clamp(min=1e-3)).mean()
+        slope = ((v * K_v).sum(-1) - hdot.gather(-1, row)[:, 0]).detach().clamp(min=1e-3)
+        return (K / slope).mean(), ((K_q_rate / (self.band.field.gamma * slope)) ** 2).mean()
 
     def check(self) -> tuple[float, float, float]:
         """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
