@@ -113,7 +113,7 @@ def train_barrier(
     if result.check.samples == 0 and (folder / "barrier.json").is_file():
         err.print(f"{folder}: the barrier already there is kept, for the new one could not be checked")
     else:
-        save_barrier(folder, problem, kind, chosen.network, result.params, trainer.filter_config, details)
+        save_barrier(folder, trainer.problem, kind, chosen.network, result.params, trainer.filter_config, details)
     return {**report, "out": str(folder)}
 
 

@@ -21,7 +21,7 @@ from ppcbf_robots.network import NetworkKind, NumpyNetwork, Params
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import BarrierSpec, Positive, Spec, validate
 
-FORMAT = 1
+FORMAT = 2
 KEYS = {"kind": str, "network": str, "formula": dict, "filter": dict, "fingerprint": dict, "weights_sha256": str,
         "robot": str, "world": str, "joints": list, "training": dict}  # fmt: skip
 PACKAGES = ("ppcbf-robots", "pin", "numpy", "torch", "proxsuite")
@@ -132,6 +132,8 @@ def load_barrier(folder: Path) -> StoredBarrier:
         raise InputError(f"{folder} is not a barrier folder: {Path(error.filename).name} is missing") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
+    if isinstance(data, dict) and data.get("format") in range(1, FORMAT):
+        raise InputError(f"{path}: a barrier of an earlier version, which this one cannot read; train it again")
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(f"{path}: not a barrier of format {FORMAT}; train it again with this version")
     for key, kind in KEYS.items():
@@ -160,8 +162,8 @@ def load_barrier(folder: Path) -> StoredBarrier:
 
 def _shapes_fit(kind: NetworkKind, params: Params, nv: int) -> bool:
     """Whether every array is there, and no other, with the shape that the layers before it and nv joints ask for."""
-    inputs = width = np.size(params.get("in_shift", ()))
-    nq = inputs - nv if kind == "mlp" else inputs
+    inputs = np.size(params.get("in_shift", ()))
+    nq, width = (inputs - nv, inputs) if kind == "mlp" else (inputs, 3 * inputs)
     shapes: dict[str, tuple[int, ...]] = {"in_shift": (inputs,), "in_scale": (inputs,)}
     for i in range(sum(name.startswith("W") and name[1:].isdigit() for name in params)):
         units = np.size(params.get(f"b{i}", ()))
@@ -171,7 +173,7 @@ def _shapes_fit(kind: NetworkKind, params: Params, nv: int) -> bool:
     if kind == "mlp":
         shapes |= {"w_out": (width,), "b_out": (), "zero_at_rest": ()}
     else:
-        shapes |= {"Wa": (width, units), "Wb": (width, units * nv), "Wc": (width, units)}
+        shapes |= {"turns": (nq,), "Wa": (width, units), "Wb": (width, units * nv), "Wc": (width, units)}
         shapes |= {"ba": (units,), "bb": (units * nv,), "bc": (units,), "v_scale": (nv,)}
     return nv <= nq <= 2 * nv and {name: w.shape for name, w in params.items()} == shapes
 

@@ -68,13 +68,16 @@ def uniform_band(
 def _least_phi(problem: Problem, barrier: Barrier, q: Array, h: Array, grad: Array, v: Array) -> Array:
     """min_k phi_k at velocities v (B, V, nv) of configurations q (B, nq); needs no dynamics for rho barriers.
 
-    Where rho < 0, rho itself is returned: K >= 0 only takes away from it, and the network is what takes time.
+    Where rho < 0, rho itself may be returned: K >= 0 only takes away from it, and the network is what takes time.
     """
     network = getattr(barrier, "network", None)
-    phi = np.asarray((np.einsum("bkn,bvn->bvk", grad, v) + barrier.spec.gamma * h[:, None, :]).min(axis=-1))
-    if network is not None:
-        b, i = np.nonzero(phi >= 0.0)
-        phi[b, i] -= network.value(q[b], v[b, i])
+    phi = np.asarray((v @ grad.transpose(0, 2, 1) + barrier.spec.gamma * h[:, None, :]).min(axis=-1))
+    if network is None:
+        return phi
+    if network.kind == "convex":  # its layers see q alone: once per configuration
+        return np.asarray(phi - network.value(q[:, None], v))
+    b, i = np.nonzero(phi >= 0.0)
+    phi[b, i] -= network.value(q[b], v[b, i])
     return phi
 
 

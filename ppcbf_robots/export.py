@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,7 +44,7 @@ _K_FORMULA: dict[NetworkKind, tuple[str, ...]] = {
         "K = d^2",
     ),
     "convex": (
-        "x = (q - in_shift) * in_scale",
+        "x = ((q - in_shift) * in_scale, cos(q * turns), sin(q * turns))",
         _HIDDEN,
         "a = softplus(x Wa + ba), c = x Wc + bc, b = (x Wb + bb) as a (units, nv) matrix",
         "z = b (v * v_scale)",
@@ -166,9 +167,18 @@ def _trace(stored: StoredBarrier, nq: int, nv: int) -> bytes:
     network, gamma = stored.network, stored.spec.gamma
     params = {k: torch.tensor(w) for k, w in network.params.items()}
 
+    class Ops:
+        """torch, but with sines for cosines: onnxruntime has cosines in float64 only since mid-2026."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(torch, name)
+
+        def cos(self, x: Any) -> Any:
+            return torch.sin(x + 0.5 * math.pi)
+
     class Phi(torch.nn.Module):
         def forward(self, q: Any, v: Any, h: Any, grad_h: Any) -> tuple[Any, ...]:
-            K, dK_dq, dK_dv = value_and_grad(torch, network.kind, params, q, v)
+            K, dK_dq, dK_dv = value_and_grad(Ops(), network.kind, params, q, v)
             return (grad_h * v).sum(-1) + gamma * h - K, K, grad_h - dK_dv, dK_dq
 
     shapes = ((2, nq), (2, nv), (2,), (2, nv))  # any batch but 1, which the tracer could take for a constant

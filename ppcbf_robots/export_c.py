@@ -67,6 +67,7 @@ static inline double ${p}_f(const double *q, const double *v, double *df)
         L.x0[i] = (v[i - ${P}_NQ] - ${p}_in_shift[i]) * ${p}_in_scale[i];
     ${p}_hidden(&L);
     ${p}_hidden_back(&L, ${p}_w_out, df);
+    for (int i = 0; i < ${P}_NQ + ${P}_NV; ++i) df[i] *= ${p}_in_scale[i];
     return ${p}_dot(${P}_LAST, L.${last}, ${p}_w_out);
 }
 
@@ -95,9 +96,14 @@ static inline double ${p}_K(const double *q, const double *v, double *dK_dq, dou
 {
     double ra[${P}_UNITS], c[${P}_UNITS], b[${P}_UNITS * ${P}_NV];
     double dra[${P}_UNITS], dc[${P}_UNITS], db[${P}_UNITS * ${P}_NV]; /* dK/dra, dK/dc, dK/db */
-    double s[${P}_NV], g[${P}_LAST], K = 0.0;
+    double s[${P}_NV], g[${P}_LAST], dx[3 * ${P}_NQ], K = 0.0;
     ${p}_layers L;
-    for (int i = 0; i < ${P}_NQ; ++i) L.x0[i] = (q[i] - ${p}_in_shift[i]) * ${p}_in_scale[i];
+    double *const cosine = L.x0 + ${P}_NQ, *const sine = L.x0 + 2 * ${P}_NQ;
+    for (int i = 0; i < ${P}_NQ; ++i) {
+        L.x0[i] = (q[i] - ${p}_in_shift[i]) * ${p}_in_scale[i];
+        cosine[i] = cos(q[i] * ${p}_turns[i]);
+        sine[i] = sin(q[i] * ${p}_turns[i]);
+    }
     ${p}_hidden(&L);
     ${p}_affine(${P}_LAST, ${P}_UNITS, L.${last}, ${p}_Wa, ${p}_ba, ra);
     ${p}_affine(${P}_LAST, ${P}_UNITS, L.${last}, ${p}_Wc, ${p}_bc, c);
@@ -122,7 +128,10 @@ static inline double ${p}_K(const double *q, const double *v, double *dK_dq, dou
     for (int i = 0; i < ${P}_LAST; ++i)
         g[i] = ${p}_dot(${P}_UNITS, ${p}_Wa + i * ${P}_UNITS, dra) + ${p}_dot(${P}_UNITS, ${p}_Wc + i * ${P}_UNITS, dc)
              + ${p}_dot(${P}_UNITS * ${P}_NV, ${p}_Wb + i * ${P}_UNITS * ${P}_NV, db);
-    ${p}_hidden_back(&L, g, dK_dq);
+    ${p}_hidden_back(&L, g, dx);
+    for (int i = 0; i < ${P}_NQ; ++i)
+        dK_dq[i] = dx[i] * ${p}_in_scale[i]
+                 + ${p}_turns[i] * (cosine[i] * dx[2 * ${P}_NQ + i] - sine[i] * dx[${P}_NQ + i]);
     return K;
 }
 """)
@@ -182,7 +191,7 @@ def c_header(network: NumpyNetwork, meta: dict[str, Any], name: str) -> str:
     """
     prefix = c_name(name)
     layers = [network.params[f"W{i}"].shape for i in range(_depth(network))]
-    n_in = network.params["in_shift"].shape[0]
+    n_in = network.params["in_shift"].shape[0] * (1 if network.kind == "mlp" else 3)
     sizes = {"p": prefix, "P": prefix.upper(), "last": f"x{len(layers)}", "width": layers[-1][1] if layers else n_in}
     body = _MLP if network.kind == "mlp" else _CONVEX
     if network.kind == "convex":
@@ -233,17 +242,18 @@ def _hidden(p: str, n_in: int, layers: list[tuple[int, ...]]) -> str:
              for i, (n, m) in enumerate(layers)]  # fmt: skip
     back, g = [], "g"
     for i, (n, m) in reversed(list(enumerate(layers))):
-        back += [f"double g{i}[{n}];", f"{p}_layer_back({n}, {m}, {p}_W{i}, {g}, L->slope{i + 1}, g{i});"]
-        g = f"g{i}"
-    back.append(f"for (int i = 0; i < {n_in}; ++i) dx[i] = {g}[i] * {p}_in_scale[i];")
+        back += [f"double g{i}[{n}];"] if i else []
+        to = f"g{i}" if i else "dx"
+        back.append(f"{p}_layer_back({n}, {m}, {p}_W{i}, {g}, L->slope{i + 1}, {to});")
+        g = to
     return "\n".join([
-        f"/* x0: scaled input; x1, x2, ...: values of the hidden layers, with their slopes. */\ntypedef struct {{\n"
+        f"/* x0: input; x1, x2, ...: values of the hidden layers, with their slopes. */\ntypedef struct {{\n"
         f"    double x0[{n_in}];", *_indent(fields), f"}} {p}_layers;\n",
         "/* All hidden layers, from x0 on. */",
         f"static inline void {p}_hidden({p}_layers *L)\n{{", *_indent(there or ["(void)L;"]), "}\n",
-        "/* Gradient dx with respect to the unscaled input, from the gradient g with respect to the last layer. */",
+        "/* Gradient dx with respect to x0, from the gradient g with respect to the last layer. */",
         f"static inline void {p}_hidden_back(const {p}_layers *L, const double *g, double *dx)\n{{",
-        *_indent(back if layers else ["(void)L;", *back]), "}\n",
+        *_indent(back or ["(void)L;", f"for (int i = 0; i < {n_in}; ++i) dx[i] = g[i];"]), "}\n",
     ])  # fmt: skip
 
 

@@ -10,6 +10,8 @@ Two forms:
 * ``convex``: ``K = Σ_j a_j(q) D_j``, where D_j is the Bregman divergence of ``z -> softplus(z + c_j(q))`` between 0 and
   ``z_j = b_j(q) · v / v_scale``, with ``a_j >= 0``. It is smooth, zero with zero gradient at rest and convex in v, so
   ``v · ∂K/∂v >= K >= 0``: the corrections of the kinetic metric dissipate (see the README's theory section).
+  Its layers see q scaled to X and, as the dynamics do, the cosine and sine of every angle (``turns`` is 1 for angles
+  and 0 for lengths and for the cos and sin of continuous joints).
 """
 
 from __future__ import annotations
@@ -74,8 +76,16 @@ def _mlp(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
     return d * d, two_d * (dy[..., :nq] - rest * dy0[..., :nq]), two_d * dy[..., nq:]
 
 
+def _features(xp: Any, p: Params, q: Any) -> tuple[Any, Any, Any]:
+    """Input (..., 3 nq) of the convex form's layers, and the cosines and sines (..., nq) in it."""
+    angle = q * p["turns"]
+    cos, sin = xp.cos(angle), xp.sin(angle)
+    return xp.concatenate([(q - p["in_shift"]) * p["in_scale"], cos, sin], -1), cos, sin
+
+
 def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
-    x, slopes = _hidden(xp, p, (q - p["in_shift"]) * p["in_scale"])
+    features, cos, sin = _features(xp, p, q)
+    x, slopes = _hidden(xp, p, features)
     units = p["ba"].shape[-1]
     ra = x @ p["Wa"] + p["ba"]
     a = _softplus(xp, ra)
@@ -91,7 +101,9 @@ def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
     dK_dv = (dz[..., None] * b).sum(-2) * p["v_scale"]
     db = (dz[..., None] * s[..., None, :]).reshape(*x.shape[:-1], -1)
     g = (D * _sigmoid(xp, ra)) @ p["Wa"].T + dc @ p["Wc"].T + db @ p["Wb"].T
-    return K, _pull_back(p, g, slopes) * p["in_scale"], dK_dv
+    g, nq = _pull_back(p, g, slopes), q.shape[-1]
+    dK_dq = g[..., :nq] * p["in_scale"] + p["turns"] * (cos * g[..., 2 * nq :] - sin * g[..., nq : 2 * nq])
+    return K, dK_dq, dK_dv
 
 
 def _mlp_out(xp: Any, p: Params, q: Any, v: Any) -> Any:
@@ -100,7 +112,7 @@ def _mlp_out(xp: Any, p: Params, q: Any, v: Any) -> Any:
 
 def _convex_units(xp: Any, p: Params, q: Any) -> tuple[Any, Any, Any]:
     """a (..., units), c (..., units) and b (..., units, nv) of the convex form."""
-    x = _hidden(xp, p, (q - p["in_shift"]) * p["in_scale"])[0]
+    x = _hidden(xp, p, _features(xp, p, q)[0])[0]
     nv = p["v_scale"].shape[-1]
     b = (x @ p["Wb"] + p["bb"]).reshape(*x.shape[:-1], p["ba"].shape[-1], nv)
     return _softplus(xp, x @ p["Wa"] + p["ba"]), x @ p["Wc"] + p["bc"], b
@@ -153,18 +165,20 @@ class NumpyNetwork:
         p = self.params
         layers = [(p[f"W{i}"], p[f"b{i}"]) for i in range(sum(f"W{i}" in p for i in range(len(p))))]
         weights = np.concatenate([np.zeros(0), *(x.ravel() for layer in layers for x in layer)])
-        widths = np.array([len(p["in_shift"]), *(len(b) for _, b in layers)])
+        inputs = len(p["in_shift"]) * (1 if self.kind == "mlp" else 3)
+        widths = np.array([inputs, *(len(b) for _, b in layers)])
         common = weights, widths, p["in_shift"], p["in_scale"]
         if self.kind == "mlp":
             return *common, p["w_out"], float(p["b_out"]), float(p["zero_at_rest"])
         heads = (np.ascontiguousarray(p[f"W{k}"].T) if w else p[f"b{k}"] for k in "abc" for w in (True, False))
-        return *common, p["v_scale"], *heads
+        return *common, p["turns"], p["v_scale"], *heads
 
 
 def random_convex(nq: int, nv: int, hidden: tuple[int, ...], units: int, rng: np.random.Generator) -> dict[str, Any]:
     """Small random parameters of the convex form; for benchmarks and examples, not a barrier to rely on."""
-    widths = (nq, *hidden)
+    widths = (3 * nq, *hidden)
     params: dict[str, Any] = {"in_shift": np.zeros(nq), "in_scale": np.ones(nq), "v_scale": np.ones(nv)}
+    params["turns"] = np.ones(nq)
     for i, (a, b) in enumerate(itertools.pairwise(widths)):
         params |= {f"W{i}": rng.normal(0.0, a**-0.5, (a, b)), f"b{i}": np.zeros(b)}
     for name, outputs, bias in (("a", units, -4.0), ("b", units * nv, 0.0), ("c", units, -1.0)):

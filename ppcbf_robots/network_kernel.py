@@ -86,13 +86,18 @@ def _sigmoid(x: float) -> float:
 
 @kernel
 def convex(
-    q: Any, v: Any, weights: Any, widths: Any, shift: Any, scale: Any, v_scale: Any,
+    q: Any, v: Any, weights: Any, widths: Any, shift: Any, scale: Any, turns: Any, v_scale: Any,
     Wa: Any, ba: Any, Wb: Any, bb: Any, Wc: Any, bc: Any,
 ) -> Any:  # fmt: skip
     """K, ∂K/∂q and ∂K/∂v of the convex form; Wa, Wc (units, width), Wb (units nv, width) are transposed."""
-    nv, units, width = len(v), len(ba), widths[-1]
+    nq, nv, units, width = len(q), len(v), len(ba), widths[-1]
     slopes = np.empty((len(widths), widths.max()))
-    x = _hidden((q - shift) * scale, weights, widths, slopes)
+    features = np.empty(3 * nq)
+    for i in range(nq):
+        angle = q[i] * turns[i]
+        features[i] = (q[i] - shift[i]) * scale[i]
+        features[nq + i], features[2 * nq + i] = math.cos(angle), math.sin(angle)
+    x = _hidden(features, weights, widths, slopes)
     s, K = v * v_scale, 0.0
     K_v, g = np.zeros(nv), np.zeros(width)
     for u in range(units):
@@ -120,4 +125,8 @@ def convex(
             weight = dz * s[j]
             for k in range(width):
                 g[k] += weight * Wb[u * nv + j, k]
-    return K, _pull_back(g, weights, widths, slopes) * scale, K_v
+    g, K_q = _pull_back(g, weights, widths, slopes), np.empty(nq)
+    for i in range(nq):
+        cos, sin = features[nq + i], features[2 * nq + i]
+        K_q[i] = g[i] * scale[i] + turns[i] * (cos * g[2 * nq + i] - sin * g[nq + i])
+    return K, K_q, K_v

@@ -152,6 +152,7 @@ class RobotModel:
         joints = list(self.model.joints)[1:]
         self.idx_q = np.array([j.idx_q for j in joints])
         self.continuous = np.array([j.nq == 2 for j in joints])
+        self.revolute = np.array([j.nq == 1 and j.shortname().startswith("JointModelR") for j in joints])  # angles in q
         self._any_continuous = bool(self.continuous.any())
         # q̇ = (rate_const + rate_sign * q[rate_partner]) * v[rate_v]: 1 for scalar joints, (-sin, cos) for continuous
         self.rate_const, self.rate_sign = np.ones(self.nq), np.zeros(self.nq)

@@ -98,14 +98,16 @@ def random_network() -> Callable[..., NumpyNetwork]:
     def build(kind: NetworkKind, nq: int, nv: int, seed: int = 0, width: int = 16, units: int = 5) -> NumpyNetwork:
         rng = np.random.default_rng(seed)
         inputs = nq + nv if kind == "mlp" else nq
+        features = inputs if kind == "mlp" else 3 * nq
         heads = {"w_out": (width,)} if kind == "mlp" else {
             "Wa": (width, units), "Wb": (width, units * nv), "Wc": (width, units),
             "ba": (units,), "bb": (units * nv,), "bc": (units,)}  # fmt: skip
-        layers = {"W0": (inputs, width), "b0": (width,), "W1": (width, width), "b1": (width,)}
+        layers = {"W0": (features, width), "b0": (width,), "W1": (width, width), "b1": (width,)}
         params = {name: rng.normal(0.0, 0.4, shape) for name, shape in {**layers, **heads}.items()}
+        params["W0"] *= (inputs / features) ** 0.5  # as steep with the cosines and sines as without
         params |= {"in_shift": rng.normal(0.0, 0.1, inputs), "in_scale": rng.uniform(0.5, 1.5, inputs)}
         params |= {"b_out": np.array(0.3), "zero_at_rest": np.array(1.0)} if kind == "mlp" else {
-            "v_scale": rng.uniform(0.5, 1.5, nv)}  # fmt: skip
+            "v_scale": rng.uniform(0.5, 1.5, nv), "turns": np.arange(nq) % 3 < 2}  # fmt: skip
         return NumpyNetwork(kind, params)
 
     return build

@@ -114,10 +114,14 @@ def shapes_changed(params):
         without = dict(params)
         del without[name]
         yield f"{name} missing", without
-    for name, axis in (("W0", 0), ("W0", 1), ("b0", 0), ("W1", 1), ("in_shift", 0), ("in_scale", 0)):
+    cuts = [("W0", 0), ("W0", 1), ("b0", 0), ("W1", 1), ("in_shift", 0), ("in_scale", 0)]
+    for name, axis in cuts + [("turns", 0)] * ("turns" in params):
         yield f"{name} cut", {**params, name: np.delete(params[name], 0, axis=axis)}
     yield "in_shift scalar", {**params, "in_shift": np.array(1.0)}
     yield "W0 flat", {**params, "W0": params["W0"].ravel()}
+    if "turns" in params:  # as before angles had cosines and sines
+        without = {k: w for k, w in params.items() if k != "turns"}
+        yield "W0 of q alone", {**without, "W0": params["W0"][: params["in_shift"].size]}
     yield "nothing", {}
 
 
@@ -142,7 +146,7 @@ def test_truncated_or_foreign_json(folder):
     assert refusal(folder).startswith(f"{path}: cannot be read (")
     for other in ("[]", "{}", "null", "3"):
         path.write_text(other)
-        assert refusal(folder) == f"{path}: not a barrier of format 1; train it again with this version"
+        assert refusal(folder) == f"{path}: not a barrier of format 2; train it again with this version"
 
 
 def test_missing_files(folder, tmp_path):
@@ -163,7 +167,10 @@ def test_missing_keys(folder, key):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"format": 2}, "not a barrier of format 1; train it again with this version"),
+        ({"format": 1}, "a barrier of an earlier version, which this one cannot read; train it again"),
+        ({"format": 3}, "not a barrier of format 2; train it again with this version"),
+        ({"format": "2"}, "not a barrier of format 2; train it again with this version"),
+        ({"format": [1]}, "not a barrier of format 2; train it again with this version"),
         ({"kind": "magic"}, "unknown kind 'magic' or network"),
         ({"network": "transformer"}, "unknown kind 'pp-ncbf' or network 'transformer'"),
         ({"kind": ["pp-ncbf"]}, "the key 'kind' does not hold a str; the file was altered"),

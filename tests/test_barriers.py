@@ -100,6 +100,38 @@ def test_networks_survive_huge_velocities(random_network, form):
     assert all(np.all(np.isfinite(x)) for x in values)
 
 
+@pytest.mark.parametrize("form", ["mlp", "convex"])
+def test_gradients_of_K_equal_central_differences(problem, random_network, states, form):
+    """In every coordinate of q, the cos and sin of continuous joints included, compiled and for many states."""
+    model, step = problem.model, 1e-6
+    network = random_network(form, model.nq, model.nv)
+    q, v = (np.array(x) for x in zip(*states(problem, 20), strict=True))
+    K, K_q, K_v = network.value_and_grad(q, v)
+    for i in range(20):
+        for got, wanted in zip(network.value_and_grad(q[i], v[i]), (K[i], K_q[i], K_v[i]), strict=True):
+            np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-12)
+    for i, e in enumerate(np.eye(model.nq)):
+        up, down = (network.value(q + s * e, v) for s in (step, -step))
+        np.testing.assert_allclose((up - down) / (2 * step), K_q[:, i], rtol=1e-6, atol=1e-6)
+    for i, e in enumerate(np.eye(model.nv)):
+        up, down = (network.value(q, v + s * e) for s in (step, -step))
+        np.testing.assert_allclose((up - down) / (2 * step), K_v[:, i], rtol=1e-6, atol=1e-6)
+
+
+def test_convex_layers_see_cosines_and_sines_of_angles_alone(random_network, states, problems):
+    """A whole turn of an angle changes the scaled angle only; other coordinates have no cosine."""
+    for problem in problems.values():
+        model = problem.model
+        network = random_network("convex", model.nq, model.nv)
+        p = network.params
+        p["W0"][: model.nq] = 0.0
+        for q, v in states(problem, 3):
+            K, K_q, _ = network.value_and_grad(q, v)
+            assert network.value_and_grad(q + 2.0 * np.pi * p["turns"], v)[0] == pytest.approx(K, rel=1e-12)
+            assert network.value_and_grad(q + 1.0 - p["turns"], v)[0] == pytest.approx(K, rel=1e-12)
+            assert np.array_equal(K_q != 0.0, p["turns"] == 1.0)
+
+
 def test_convex_K_grows_at_least_linearly_along_rays(problem, random_network, states):
     """v · ∂K/∂v >= K >= 0 and midpoint convexity in v, on which passivity by construction rests."""
     network = random_network("convex", problem.model.nq, problem.model.nv)

@@ -43,7 +43,7 @@ def random_network(kind: str, nq: int, nv: int, rng: np.random.Generator, widths
     """K_theta with weights of order one; the widths are no multiples of the unrolled loops of the C header."""
     n_in = nq + nv if kind == "mlp" else nq
     params: dict[str, Any] = {"in_shift": rng.normal(size=n_in), "in_scale": rng.uniform(0.3, 1.5, n_in)}
-    n = n_in
+    n = n_in if kind == "mlp" else 3 * nq
     for i, m in enumerate(widths):
         params[f"W{i}"], params[f"b{i}"] = rng.normal(size=(n, m)) / np.sqrt(n), rng.normal(size=m)
         n = m
@@ -52,7 +52,7 @@ def random_network(kind: str, nq: int, nv: int, rng: np.random.Generator, widths
     else:
         for name, m in (("a", units), ("c", units), ("b", units * nv)):
             params[f"W{name}"], params[f"b{name}"] = rng.normal(size=(n, m)) / np.sqrt(n), rng.normal(size=m)
-        params["v_scale"] = rng.uniform(0.3, 1.5, nv)
+        params |= {"v_scale": rng.uniform(0.3, 1.5, nv), "turns": rng.integers(0, 2, nq)}
     return NumpyNetwork(kind, params)
 
 
@@ -161,7 +161,7 @@ def test_npz_round_trip_is_exact(robot: str, kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("robot", "kind"), CASES)
 def test_onnx_equals_numpy_for_any_batch(robot: str, kind: str, tmp_path: Path) -> None:
-    pytest.importorskip("onnx")
+    onnx = pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
     stored, path = stored_barrier(robot, kind), tmp_path / "barrier.onnx"
     export_barrier(stored, path, "onnx")
@@ -172,6 +172,8 @@ def test_onnx_equals_numpy_for_any_batch(robot: str, kind: str, tmp_path: Path) 
         for name, got in zip(wanted, session.run(list(wanted), inputs), strict=True):
             assert got.dtype == np.float64
             assert_close(got, wanted[name], 1e-12)
+    operators = {node.op_type for node in onnx.load(path).graph.node}
+    assert "Cos" not in operators and ("Sin" in operators) == (kind == "convex")
     props = session.get_modelmeta().custom_metadata_map
     assert json.loads(props["joints"]) == stored.data["joints"] and float(props["gamma"]) == 4.3
     assert [o.shape for o in session.get_outputs()] == [["batch"]] * 2 + [["batch", n] for n in sizes(robot)[::-1]]

@@ -363,7 +363,7 @@ def test_every_weight_but_the_constants_is_trained(cartpole, preset, kind):
         trainer._iterate()
     changed = {k for k, x in trainer._snapshot().items() if not np.array_equal(x, before[k])}
     assert before.keys() - changed == {"in_shift", "in_scale"} | ({"zero_at_rest", "b_out"} & before.keys()) | (
-        {"v_scale"} & before.keys()
+        {"turns", "v_scale"} & before.keys()
     )  # at rest f(q, 0) is taken away, and b_out with it
 
 

@@ -18,26 +18,26 @@ FILE = "checkpoint.safetensors"
 
 def save_checkpoint(trainer: Trainer, folder: Path) -> None:
     """Write the checkpoint of a trainer into a folder, replacing the last one."""
-    tensors = {f"param/{k}": x.detach().cpu().contiguous() for k, x in trainer.params.items()}
-    for k, name in enumerate(trainer.trained):
-        for key, x in trainer.optimizer.state_dict()["state"].get(k, {}).items():
-            tensors[f"adam/{name}/{key}"] = x.detach().cpu().reshape(x.shape).clone()
-    tensors["generator"] = trainer.generator.get_state()
-    tensors["buffer/index"], tensors["buffer/s"] = (x.detach().cpu().contiguous() for x in trainer.buffer)
+    descent = trainer.descent
+    tensors = {f"param/{k}": x for k, x in descent.params.items()}
+    for k, name in enumerate(descent.trained):
+        for key, x in descent.optimizer.state_dict()["state"].get(k, {}).items():
+            tensors[f"adam/{name}/{key}"] = x
+    tensors["generator"] = descent.generator.get_state()
+    own, numbers = descent.state()
+    tensors |= {f"descent/{k}": x for k, x in own.items()}
     for j, (volume, params) in enumerate(trainer.clean):
         tensors |= {f"clean/{j}/{k}": torch.as_tensor(x) for k, x in params.items()}
         tensors[f"clean/{j}/volume"] = torch.tensor(volume)
-    for j, states in enumerate(trainer.counterexamples):
-        tensors |= {f"counterexamples/{j}/{k}": torch.as_tensor(x) for k, x in zip("qv", states, strict=True)}
     state = {
         "identity": trainer.identity(),
-        "iteration": trainer.iteration,
-        "planned": trainer.planned,
-        "weights": trainer.weights,
-        "margin": trainer.margin,
-        "rng": trainer.rng.bit_generator.state,
+        "iteration": descent.iteration,
+        "planned": descent.planned,
+        "descent": numbers,
+        "rng": descent.rng.bit_generator.state,
         "history": [dataclasses.asdict(monitor) for monitor in trainer.history],
     }
+    tensors = {k: x.detach().cpu().contiguous().clone() for k, x in tensors.items()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         save_file(tensors, folder / f".{FILE}.tmp", metadata={"state": json.dumps(state)})
@@ -65,30 +65,27 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
         raise InputError(
             f"{path}: belongs to another robot, world, preset, barrier or seed; resume with the same options"
         )
-    for k in trainer.trained:
+    descent = trainer.descent
+    for k in descent.trained:
         with torch.no_grad():
-            trainer.params[k].copy_(tensors[f"param/{k}"])
-    adam = trainer.optimizer.state_dict()
-    for i, name in enumerate(trainer.trained):
-        prefix = f"adam/{name}/"
-        found = {k.removeprefix(prefix): x for k, x in tensors.items() if k.startswith(prefix)}
+            descent.params[k].copy_(tensors[f"param/{k}"])
+    adam = descent.optimizer.state_dict()
+    for i, name in enumerate(descent.trained):
+        found = _below(tensors, f"adam/{name}/")
         if found:
             adam["state"][i] = found
-    trainer.optimizer.load_state_dict(adam)
-    trainer.generator.set_state(tensors["generator"])
-    trainer.buffer = (tensors["buffer/index"].to(trainer.device), tensors["buffer/s"].to(trainer.device))
-    for j in range(sum(k.startswith("counterexamples/") for k in tensors) // 2):
-        trainer.add_counterexamples(*(tensors[f"counterexamples/{j}/{k}"].numpy() for k in "qv"))
-    count = sum(k.endswith("/volume") for k in tensors)
-    trainer.clean = [
-        (
-            float(tensors[f"clean/{j}/volume"]),
-            {k.split("/", 2)[2]: x.numpy() for k, x in tensors.items()
-             if k.startswith(f"clean/{j}/") and not k.endswith("/volume")},
-        )
-        for j in range(count)
-    ]  # fmt: skip
-    trainer.iteration, trainer.planned = state["iteration"], state["planned"]
-    trainer.weights, trainer.margin = state["weights"], state["margin"]
-    trainer.rng.bit_generator.state = state["rng"]
-    trainer.history = [Monitor(**{**monitor, "weights": tuple(monitor["weights"])}) for monitor in state["history"]]
+    descent.optimizer.load_state_dict(adam)
+    descent.restore(_below(tensors, "descent/"), state["descent"])
+    descent.generator.set_state(tensors["generator"])
+    trainer.clean = []
+    while clean := _below(tensors, f"clean/{len(trainer.clean)}/"):
+        volume = float(clean.pop("volume"))
+        trainer.clean.append((volume, {k: x.numpy() for k, x in clean.items()}))
+    descent.iteration, descent.planned = state["iteration"], state["planned"]
+    descent.rng.bit_generator.state = state["rng"]
+    trainer.history = [Monitor(**monitor) for monitor in state["history"]]
+
+
+def _below(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Tensors whose name starts with a prefix, without it."""
+    return {k.removeprefix(prefix): x for k, x in tensors.items() if k.startswith(prefix)}

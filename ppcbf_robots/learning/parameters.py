@@ -10,7 +10,7 @@ from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.problem import Problem
 
 Tensors = dict[str, torch.Tensor]
-CONSTANTS = ("in_shift", "in_scale", "v_scale", "zero_at_rest")  # parameters that are not trained
+CONSTANTS = ("in_shift", "in_scale", "turns", "v_scale", "zero_at_rest")  # parameters that are not trained
 
 
 def initial_parameters(problem: Problem, preset: Preset, generator: torch.Generator) -> Tensors:
@@ -22,6 +22,9 @@ def initial_parameters(problem: Problem, preset: Preset, generator: torch.Genera
         scale = torch.cat([scale, 1.0 / v_max])
     p: Tensors = {"in_shift": shift, "in_scale": scale}
     width = len(shift)
+    if preset.network == "convex":
+        p["turns"] = _angles(problem)
+        width *= 3
     for i, units in enumerate(preset.hidden):
         p[f"W{i}"], p[f"b{i}"] = _linear(width, units, generator)
         width = units
@@ -37,6 +40,13 @@ def initial_parameters(problem: Problem, preset: Preset, generator: torch.Genera
     p["Wb"], _ = _linear(width, units * nv, generator)
     p["bb"] = torch.randn(units * nv, generator=generator, dtype=torch.float64) * 2.0
     return p
+
+
+def _angles(problem: Problem) -> torch.Tensor:
+    """1 for every coordinate of q that is an angle, else 0."""
+    turns = torch.zeros(problem.model.nq, dtype=torch.float64)
+    turns[problem.model.idx_q[problem.model.revolute]] = 1.0
+    return turns
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:

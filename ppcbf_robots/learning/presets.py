@@ -17,30 +17,35 @@ class Preset:
 
     network: NetworkKind
     hidden: tuple[int, ...]
-    filter: FilterKind  # what the critic assumes will run
+    filter: FilterKind  # what the critic assumes will run; it decides how the learner descends
     metric: Metric
     learning_rate: float
+    gamma: float | None = None  # [1/s], where the robot spec gives none
     units: int = 0  # convex network: number of terms
-    samples: int = 500  # N, new band states per iteration
-    epochs: int = 1  # E, gradient steps per iteration
-    top: int = 100  # k of Top_k
-    l2: float = 0.0  # weight of the L2 penalty (mean square of the weights)
-    volume_weight: float = 1.0  # of the regularisation term R, eq. (16)
-    critic_weight: float = 10.0  # initial λ of every constraint
-    critic_growth: float = 1.01  # factor on λ after an iteration with violations
-    critic_decay: float = 0.99  # factor on λ after one without
-    critic_bounds: tuple[float, float] = (1.0, 1000.0)
+    samples: int = 1000  # N, new band states per iteration
+    epochs: int = 1  # closed form: E, gradient steps per iteration
+    top: int = 100  # closed form: k of Top_k
+    l2: float = 0.0  # weight of the L2 penalty; closed form: mean square of the weights, QP: square of the heads'
+    volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: the largest weight of the volume
+    worst_weight: float = 0.0  # QP: of the mean over violations, beside their sum over the batch
+    critic_weight: float = 10.0  # closed form: initial λ of both constraints
+    critic_growth: float = 1.01  # closed form: factor on λ after an iteration with violations
+    critic_decay: float = 0.99  # closed form: factor on λ after one without
+    critic_bounds: tuple[float, float] = (1.0, 1000.0)  # closed form
     margin: float = 0.03  # dimensionless reserve the critics ask for in training
-    random_goals: float = 0.0  # share of states whose nominal torque aims at a random goal
+    random_goals: float = 0.0  # share of rays whose nominal torque aims at a random goal
     rays: int = 20_000
     rows_per_ray: int = 8
     iterations: int = 800  # planned; the learning rate falls to a tenth over them
     check_every: int = 50  # iterations between checks on fresh states
     patience: int = 6  # clean checks in a row, without gain of volume, that end training early
-    counterexample_copies: int = 50  # how often a counterexample's ray stands in the pool
-    refinements: int = 4  # further rounds when the final check finds violations
+    counterexample_copies: int = 15  # closed form: how often a counterexample's ray stands in the pool
+    search_rounds: int = 0  # QP: of the falsifier at every check
+    refinements: int = 4  # further rounds when the evidence finds violations
+    refinement_share: float = 0.5  # of the planned iterations, added by each
     min_volume: float = 0.2  # of the LB set; less counts as collapsed
-    test_samples: int = 5_000  # uniform band states of the final check
+    test_samples: int = 5_000  # uniform band states of the evidence
+    attack_rounds: int = 0  # QP: of the falsifier in the evidence
     changes: tuple[str, ...] = field(default=())  # departures from the paper, shown to the user
 
 
@@ -50,11 +55,9 @@ PAPER = Preset(
     filter="closed-form",
     metric="torque",
     learning_rate=3e-4,
-    samples=1000,
     top=200,
     l2=1e-2,
     critic_bounds=(1.0, 10_000.0),
-    counterexample_copies=15,  # with 50 the set gave up 4 % of its volume for a handful of them
     iterations=2_000,
     changes=(
         "K is zero at rest: K = (f(q, v) - f(q, 0))^2 instead of f(q, v)^2, which lets every resting posture stay safe",
@@ -73,7 +76,18 @@ DEFAULT = Preset(
     filter="qp",
     metric="kinetic",
     learning_rate=3e-3,
+    gamma=10.0,
+    volume_weight=0.2,
+    worst_weight=0.05,
+    l2=0.1,
     random_goals=0.5,
+    rays=60_000,
+    iterations=1_000,
+    search_rounds=8,
+    refinements=8,
+    refinement_share=0.3,
+    test_samples=10_000,
+    attack_rounds=60,
 )
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}

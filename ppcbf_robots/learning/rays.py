@@ -54,7 +54,7 @@ class Rays:
             **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in dataclasses.fields(self)}
         )
 
-    def select(self, index: torch.Tensor) -> Rays:
+    def select(self, index: torch.Tensor | slice) -> Rays:
         """Some of the rays."""
         return Rays(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
 
@@ -93,6 +93,15 @@ class Field:
         return rho_rows(
             rays.h, hdot, rays.grad, s2 * rays.eta, rays.Minv, rays.g + s2 * rays.beta, self.gamma, K, K_q_rate, K_v
         )
+
+    @torch.no_grad()
+    def crosses(self, params: Params, rays: Rays, level: torch.Tensor) -> torch.Tensor:
+        """Which rays start above a level (B,) of ``min_k phi_k`` and end below it."""
+        hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
+        K = value_along(torch, self.kind, params, rays.q, rays.d)(torch.ones_like(level))
+        ends: torch.Tensor = (hdot + self.gamma * rays.h).amin(-1) - K
+        starts: torch.Tensor = self.gamma * rays.h.amin(-1)
+        return (starts >= level) & (ends < level)
 
     @torch.no_grad()
     def on_band(self, params: Params, rays: Rays, level: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -140,22 +149,22 @@ def build_pool(
             domain.sample_q(rng, CHUNK),
             problem.model.to_angles(problem.robot.goal),
         )
-        ray, states = rays_at(problem, problem.model.from_angles(angles), v, rows, goals)
-        rays.append(ray)
-        volume.append(states)
-        kept, tried = kept + len(ray["q"]), tried + CHUNK
+        q = problem.model.from_angles(angles)
+        ray, rho, free = rays_at(problem, q, v, rows, goals)
+        rays.append({k: x[free] for k, x in ray.items()})
+        volume.append({"q": q[free], "v": v[free], "rho": rho[free]})
+        kept, tried = kept + int(free.sum()), tried + CHUNK
     return rays, volume
 
 
 def rays_at(
     problem: Problem, q: Array, v: Array, rows: int, goal_angles: Array | None = None
-) -> tuple[RayArrays, RayArrays]:
-    """Rays through the states (q, v) that are free of collision, and those states with their least rho."""
+) -> tuple[RayArrays, Array, Array]:
+    """Rays through B states (q, v), the states' least rho (B,), and whether each is free of collision (B,)."""
     gamma = problem.robot.spec.barrier.gamma
     d = _to_face(v, problem.robot.domain.v)
     dyn = problem.model.evaluate_batch(q, d)
     safety = problem.safety.evaluate(dyn)
-    free = safety.h.min(axis=-1) >= 0.0
     hdot = (safety.grad @ d[..., None])[..., 0]
     nearest = np.argsort(gamma * safety.h + np.minimum(hdot, 0.0), axis=-1)[:, :rows]
     pick = np.take_along_axis
@@ -166,7 +175,7 @@ def rays_at(
         "u_rest": problem.robot.controller.u_rest(q, dyn.g, goal_angles),
     }  # fmt: skip
     rho = ((safety.grad @ v[..., None])[..., 0] + gamma * safety.h).min(axis=-1)
-    return {k: x[free] for k, x in rays.items()}, {"q": q[free], "v": v[free], "rho": rho[free]}
+    return rays, rho, safety.h.min(axis=-1) >= 0.0
 
 
 def to_tensors(parts: list[RayArrays], device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:

@@ -1,0 +1,78 @@
+"""The band of a barrier in training: states on it, and how they fare with the filter that will run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ppcbf_robots.barriers import BarrierRows
+from ppcbf_robots.filters import NEAR_REST, FilterConfig
+from ppcbf_robots.learning.critics import feasibility_margin
+from ppcbf_robots.learning.rays import Field, Rays
+from ppcbf_robots.network import NetworkKind, Params
+from ppcbf_robots.problem import Problem
+
+LEVELS = (0.0, 0.5, 1.0)  # of epsilon, at which a ray's least margin is sought
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """States v = s d of B rays under the nominal controller."""
+
+    v: torch.Tensor  # (B, nv)
+    u_des: torch.Tensor  # (B, nv)
+    d_p: torch.Tensor  # (B,) [W]
+
+
+class Band:
+    """Everything of a problem that a band state is judged by, on one device.
+
+    Args:
+        problem: robot, world and controller.
+        network: form of K_theta.
+        config: the runtime filter.
+        passive: whether the passivity row counts.
+        device, dtype: of all tensors.
+    """
+
+    def __init__(
+        self, problem: Problem, network: NetworkKind, config: FilterConfig, passive: bool, device: torch.device,
+        dtype: torch.dtype,
+    ) -> None:  # fmt: skip
+        model, spec = problem.model, problem.robot.spec.barrier
+        self.field = Field(model, network, spec.gamma, device, dtype)
+        self.config, self.passive, self.epsilon = config, passive, spec.epsilon
+        self.u_max = torch.as_tensor(model.u_max, device=device, dtype=dtype)
+        self.kd = torch.as_tensor(problem.robot.controller.gains.kd, device=device, dtype=dtype)
+        self.slow = torch.as_tensor(NEAR_REST * model.v_max, device=device, dtype=dtype)
+
+    def nominal(self, rays: Rays, s: torch.Tensor) -> Nominal:
+        """The nominal torque at v = s d and its dissipation."""
+        v = s[:, None] * rays.d
+        return Nominal(v, rays.u_rest - self.kd * v, (self.kd * v * v).sum(-1))
+
+    def margin(
+        self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None
+    ) -> tuple[torch.Tensor, BarrierRows]:
+        """The QP's exact feasibility margin (B,), without the passivity row near rest, and the rows it is of."""
+        rows, nominal = self.field.rows(params, rays, s), self.nominal(rays, s)
+        wanted = self.passive if passive is None else passive
+        moving = (nominal.v.abs() > self.slow).any(-1) & wanted
+        margin = feasibility_margin(rows, nominal.v, nominal.u_des, nominal.d_p, self.u_max, self.config, moving)
+        return margin, rows
+
+    @torch.no_grad()
+    def least_margin(self, params: Params, rays: Rays) -> tuple[torch.Tensor, torch.Tensor]:
+        """Least margin over the band along every ray (B,), infinite where none crosses it, and its s (B,)."""
+        least, at = torch.full_like(rays.d[:, 0], torch.inf), torch.zeros_like(rays.d[:, 0])
+        for level in LEVELS:
+            s, crosses = self.field.on_band(params, rays, torch.full_like(least, level * self.epsilon))
+            found = crosses.nonzero()[:, 0]
+            if not len(found):
+                continue
+            margin = self.margin(params, rays.select(found), s[found])[0]
+            lower = margin < least[found]
+            better = found[lower]
+            least[better], at[better] = margin[lower], s[better]
+        return least, at

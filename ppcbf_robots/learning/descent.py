@@ -1,0 +1,137 @@
+"""What every descent on a barrier's parameters has: rays, parameters, optimiser, band states and volume."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.filters import FilterConfig
+from ppcbf_robots.learning.band import Band
+from ppcbf_robots.learning.falsifier import Attack
+from ppcbf_robots.learning.parameters import CONSTANTS, Tensors, initial_parameters
+from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.learning.rays import Rays, VolumeStates, build_pool, rays_at, to_tensors
+from ppcbf_robots.problem import Problem
+from ppcbf_robots.specs import Array
+
+LearnedKind = Literal["ncbf", "pp-ncbf"]
+CHECK_STATES = 4_000
+LAST_RATE = 0.1  # of the learning rate, at the end of the planned iterations
+
+
+class Descent(ABC):
+    """One run's parameters and the states they descend on.
+
+    Args:
+        problem: robot, world and controller.
+        kind: ``pp-ncbf`` trains for torque limits and passivity, ``ncbf`` for torque limits alone.
+        preset: all settings.
+        seed: fixes every random draw.
+        device: where the loop runs.
+
+    Raises:
+        InputError: if almost no configuration of X is free of collision.
+    """
+
+    def __init__(self, problem: Problem, kind: LearnedKind, preset: Preset, seed: int, device: str) -> None:
+        self.problem, self.kind, self.preset = problem, kind, preset
+        self.device, self.dtype = torch.device(device), torch.float32
+        self.generator = torch.Generator().manual_seed(seed)
+        self.rng = np.random.default_rng(seed)
+        self.filter_config = FilterConfig(kind=preset.filter, metric=preset.metric)
+        self.rays, self.volume = self._pool()
+        params = initial_parameters(problem, preset, self.generator)
+        self.params: Tensors = {k: x.to(self.device, self.dtype) for k, x in params.items()}
+        self.trained = [k for k in self.params if k not in CONSTANTS]
+        self.optimizer = torch.optim.Adam([self.params[k].requires_grad_() for k in self.trained])
+        passive = kind == "pp-ncbf"
+        self.band = Band(problem, preset.network, self.filter_config, passive, self.device, self.dtype)
+        self.epsilon = self.band.epsilon
+        self.margin = preset.margin
+        self.iteration, self.planned = 0, preset.iterations
+        self.loss = float("nan")
+
+    @abstractmethod
+    def iterate(self) -> None:
+        """One iteration: states on the band, a gradient step, the weights' update."""
+
+    @abstractmethod
+    def check(self) -> tuple[float, float, float]:
+        """On fresh band states: share of rays that have one, of states whose torque fails, and whose passivity does."""
+
+    @abstractmethod
+    def add_counterexamples(self, q: Array, v: Array) -> None:
+        """Rays through violating states (N, nq), (N, nv) join the pool."""
+
+    @abstractmethod
+    def demand_more(self) -> None:
+        """What is asked for becomes stricter, since the evidence found violations."""
+
+    @abstractmethod
+    def attack(self, params: dict[str, Array]) -> Attack | None:
+        """A search for violating states of given parameters; None where there is none."""
+
+    @abstractmethod
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        """What a checkpoint must hold besides parameters, optimiser and random generators."""
+
+    @abstractmethod
+    def restore(self, tensors: Tensors, numbers: dict[str, Any]) -> None:
+        """Go on from what :meth:`state` gave."""
+
+    def _tensor(self, x: Array) -> torch.Tensor:
+        return torch.as_tensor(x, device=self.device, dtype=self.dtype)
+
+    def _pool(self) -> tuple[Rays, VolumeStates]:
+        p = self.preset
+        rays, volume = build_pool(self.problem, p.rays, p.rows_per_ray, p.random_goals, self.rng)
+        free = sum(len(r["q"]) for r in rays)
+        if free < 200:
+            raise InputError(
+                "almost every configuration of the domain X is in collision; shrink X or move the obstacles"
+            )
+        pool = Rays(**to_tensors(rays, self.device, self.dtype))
+        gamma = self.problem.robot.spec.barrier.gamma
+        return pool.without_far_rows(gamma), VolumeStates(**to_tensors(volume, self.device, self.dtype))
+
+    def rays_through(self, q: Array, v: Array) -> Rays:
+        """Rays through the states (q, v) that are free of collision."""
+        arrays, _, free = rays_at(self.problem, q, v, self.rays.h.shape[1])
+        return Rays(**to_tensors([{k: x[free] for k, x in arrays.items()}], self.device, self.dtype))
+
+    def set_rate(self) -> None:
+        """The learning rate falls linearly over the planned iterations."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.preset.learning_rate * max(LAST_RATE, 1.0 - self.iteration / self.preset.iterations)
+
+    def sample(self, count: int, pool: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Band states at random levels of phi on random rays (of ``pool``): ray indices, s, and whether each ray crosses.
+
+        Only the states that cross come back, with the mask (count,) of all.
+        """
+        index = torch.randint(len(self.rays) if pool is None else len(pool), (count,), generator=self.generator)
+        index = index.to(self.device) if pool is None else pool[index.to(self.device)]
+        level = torch.rand(count, generator=self.generator).to(self.device, self.dtype) * self.epsilon
+        s, crosses = self.band.field.on_band(self.params, self.rays.select(index), level)
+        return index[crosses], s[crosses], crosses
+
+    @torch.no_grad()
+    def volume_kept(self) -> float:
+        """Volume of the safe set over that of the LB set, on uniform states of X."""
+        K = self.band.field.K(self.params, self.volume.q, self.volume.v)[0]
+        lb = self.volume.rho >= 0.0
+        return float((self.volume.rho - K >= 0.0).sum() / lb.sum().clamp(min=1))
+
+    def snapshot(self) -> dict[str, Array]:
+        """The parameters as float64 arrays."""
+        return {k: x.detach().cpu().double().numpy().copy() for k, x in self.params.items()}
+
+    def load(self, params: dict[str, Array]) -> None:
+        """Replace the parameters' values."""
+        with torch.no_grad():
+            for k, x in params.items():
+                self.params[k].copy_(self._tensor(x))

@@ -1,0 +1,129 @@
+"""Search for band states on which the runtime filter has no feasible torque: descent on the exact margin from many starts.
+
+The margin is a function of q and of the direction d of v; the speed follows from the level of phi. Gradients are finite
+differences through Pinocchio and the geometry, all starts at once; the differences themselves are candidates too, so
+that kinks (another row, another vertex of the box) do not stop the search.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ppcbf_robots.learning.band import Band
+from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
+from ppcbf_robots.problem import Problem
+from ppcbf_robots.specs import Array
+
+STARTS = 48  # searched from at once
+PROBES = 40  # random points for every start, of which the worst is taken
+FIRST_STEP = 0.02  # of X's width, of the finite differences
+LAST_STEP = 2e-4  # below which a start is given up and replaced
+STRIDES = (0.5, 2.0, 8.0)  # gradient steps tried, in units of the difference's step
+
+
+@dataclass(frozen=True)
+class Attack:
+    """What a search found."""
+
+    worst: float  # least margin seen
+    q: Array  # (found, nq) states with a negative margin
+    v: Array  # (found, nv)
+    evaluated: int
+
+
+class Falsifier:
+    """Searches for states of negative margin.
+
+    Args:
+        problem: robot, world and controller, with the gamma of the barrier.
+        band: how states are judged.
+        rows: near rows per ray.
+        rng: source of randomness.
+    """
+
+    def __init__(self, problem: Problem, band: Band, rows: int, rng: np.random.Generator) -> None:
+        self.problem, self.band, self.rows, self.rng = problem, band, rows, rng
+        domain = problem.robot.domain
+        self._low = np.concatenate([domain.q[:, 0], domain.v[:, 0]])
+        self._high = np.concatenate([domain.q[:, 1], domain.v[:, 1]])
+        self._width = self._high - self._low
+
+    def margins(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
+        """Least margins (B,) of points (B, 2 nv) of angles and directions, infinite off the band, and states q, v."""
+        nv = self.problem.model.nv
+        q = self.problem.model.from_angles(points[:, :nv])
+        arrays, _, free = rays_at(self.problem, q, points[:, nv:], self.rows)
+        device, dtype = self.band.u_max.device, self.band.u_max.dtype
+        index = np.flatnonzero(free)
+        margin, v = np.full(len(points), np.inf), np.zeros((len(points), nv))
+        if len(index):
+            rays = Rays(**to_tensors([{k: x[index] for k, x in arrays.items()}], device, dtype))
+            least, s = self.band.least_margin(params, rays)
+            margin[index] = least.cpu().numpy()
+            v[index] = (s[:, None] * rays.d).cpu().numpy()
+        return margin, q, v
+
+    def search(
+        self,
+        params: Mapping[str, torch.Tensor],
+        rounds: int | None = None,
+        seconds: float = float("inf"),
+        starts: Array | None = None,
+    ) -> Attack:
+        """Descend from the worst of random points (or from ``starts`` (B, 2 nv)) until rounds or seconds are used up."""
+        began, evaluated, done = time.monotonic(), 0, 0
+        points = self._fresh(params, STARTS) if starts is None else starts
+        value = self.margins(params, points)[0]
+        step = np.full(len(points), FIRST_STEP)
+        found: list[tuple[Array, Array]] = []
+        worst = float(value.min(initial=np.inf))
+        while (rounds is None or done < rounds) and time.monotonic() - began < seconds and len(points):
+            points, value, step, new, count = self._descend(params, points, value, step)
+            found += new
+            worst = min(worst, float(value.min()))
+            evaluated, done = evaluated + count, done + 1
+            spent = step < LAST_STEP
+            if spent.any():
+                points[spent] = self._fresh(params, int(spent.sum()))
+                value[spent], step[spent] = self.margins(params, points[spent])[0], FIRST_STEP
+        nq, nv = self.problem.model.nq, self.problem.model.nv
+        q = np.concatenate([x for x, _ in found]) if found else np.zeros((0, nq))
+        v = np.concatenate([x for _, x in found]) if found else np.zeros((0, nv))
+        return Attack(worst, q, v, evaluated)
+
+    def _fresh(self, params: Mapping[str, torch.Tensor], count: int) -> Array:
+        """The worst ``count`` of random points."""
+        points = self.rng.uniform(self._low, self._high, (PROBES * count, len(self._low)))
+        return points[np.argsort(self.margins(params, points)[0])[:count]]
+
+    def _descend(
+        self, params: Mapping[str, torch.Tensor], points: Array, value: Array, step: Array
+    ) -> tuple[Array, Array, Array, list[tuple[Array, Array]], int]:
+        """One round: differences in every coordinate, strides along the gradient, the best point seen of each start."""
+        B, n = points.shape
+        sign = np.where(self.rng.random((B, n)) < 0.5, -1.0, 1.0)
+        tried = np.repeat(points[:, None], n, 1)
+        tried[:, np.arange(n), np.arange(n)] += sign * step[:, None] * self._width
+        tried = np.clip(tried, self._low, self._high)
+        near, q, v = self.margins(params, tried.reshape(B * n, n))
+        near = near.reshape(B, n)
+        slope = np.where(np.isfinite(near) & np.isfinite(value)[:, None], (near - value[:, None]) * sign, 0.0)
+        direction = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+        strides = np.array(STRIDES)[None, :, None] * step[:, None, None] * direction[:, None] * self._width
+        along = np.clip(points[:, None] + strides, self._low, self._high)
+        far, q_far, v_far = self.margins(params, along.reshape(-1, n))
+        values = np.concatenate([near, far.reshape(B, -1)], 1)
+        candidates = np.concatenate([tried, along], 1)
+        best = values.argmin(1)
+        start = np.arange(B)
+        better = values[start, best] < value
+        points = np.where(better[:, None], candidates[start, best], points)
+        bad, bad_far = near.ravel() < 0.0, far < 0.0
+        found = [(q[bad], v[bad]), (q_far[bad_far], v_far[bad_far])]
+        return (points, np.where(better, values[start, best], value), np.where(better, step, 0.5 * step),
+                [f for f in found if len(f[0])], values.size)  # fmt: skip

@@ -1,0 +1,203 @@
+"""Descent on the exact feasibility margin of the runtime QP, for the largest set that keeps it positive.
+
+The loss is ``weight · E[-δ log s*] + E[(margin wanted - margin)₊]``: the first term moves the set's boundary outwards
+along every ray v = s d, counted relative to the ray's length so that slow motions weigh as much as fast ones; the second
+is a sum over violations, half of them drawn where the margin was smallest so far. While nothing violates, the weight
+grows and the set with it; violations shrink it. At every check the surroundings of the smallest margins are explored
+with new rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
+from ppcbf_robots.learning.falsifier import STARTS, Attack, Falsifier
+from ppcbf_robots.learning.parameters import Tensors
+from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.learning.rays import Rays
+from ppcbf_robots.problem import Problem
+from ppcbf_robots.specs import Array
+
+NEAR = 4.0  # times the wanted margin: rays below it are drawn as often as all others together
+FAR_AWAY = 1.0  # margin noted for rays that do not cross the band
+EXPLORED = 1_600  # new rays per check, around those of small margin
+SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
+POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
+WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
+LEAST_WEIGHT = 0.2  # of the largest
+VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
+STRICTER = 1.15  # factor on the wanted margin per refinement
+MAX_MARGIN = 0.3
+SIMPLER = 2.0  # factor on the penalty of what depends on q, per refinement
+TAKEN = 300  # states at most that join from one search
+HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
+
+
+class MarginDescent(Descent):
+    """See the module and :class:`Descent`."""
+
+    def __init__(self, problem: Problem, kind: LearnedKind, preset: Preset, seed: int, device: str) -> None:
+        super().__init__(problem, kind, preset, seed, device)
+        self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
+        self._first_pool = len(self.rays)
+        self._max_weight, self._simplicity = preset.volume_weight, preset.l2
+        self._weight = torch.tensor(preset.volume_weight, device=self.device)
+        self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
+        self._look()
+
+    def iterate(self) -> None:
+        """A batch of band states, half of them where margins are small; one step; the weight's update."""
+        p = self.preset
+        self.set_rate()
+        index, s, _ = self.sample(p.samples, self._crossing)
+        drawn = len(index)
+        if len(self._near):
+            near, s_near, _ = self.sample(p.samples, self._near)
+            index, s = torch.cat([index, near]), torch.cat([s, s_near])
+        self.iteration += 1
+        if not drawn:
+            return  # the band is empty: the set has collapsed, and the checks will say so
+        rays = self.rays.select(index)
+        with torch.no_grad():
+            margin = self.band.margin(self.params, rays, s)[0]
+            self._noted[index] = margin
+        shrinkage, unrest = self._shrinkage(rays.select(slice(drawn)), s[:drawn])
+        loss = self._weight * shrinkage + self._simplicity * unrest
+        short = (margin < self.margin).nonzero()[:, 0]  # the others have no gradient
+        if len(short):
+            wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short])[0])
+            loss = loss + wanting.sum() / len(index) + p.worst_weight * wanting.mean()
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        self.loss = loss.detach()
+        violated = (margin[:drawn] < 0.0).to(self.dtype).mean() > VIOLATED
+        factor = torch.where(violated, WEIGHT_FALL, WEIGHT_GROWTH)
+        self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
+
+    def _shrinkage(self, rays: Rays, s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean of -log s*, with the boundary's s* on each ray, and how much K changes along the motion, without dimensions.
+
+        The first is given up to a constant: its gradient is that of ``K / |∂phi/∂log s|``.
+        """
+        v = s[:, None] * rays.d
+        K, K_q_rate, K_v = self.band.field.K(self.params, rays.q, v)
+        hdot = (rays.grad @ v[..., None])[..., 0]
+        row = (hdot + self.band.field.gamma * rays.h).argmin(-1, keepdim=True)
+        slope = ((v * K_v).sum(-1) - hdot.gather(-1, row)[:, 0]).detach().clamp(min=1e-3)
+        return (K / slope).mean(), ((K_q_rate / (self.band.field.gamma * slope)) ** 2).mean()
+
+    def check(self) -> tuple[float, float, float]:
+        """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
+        found = self._explore()
+        self._look()
+        attack = self.falsifier.search(self.params, rounds=self.preset.search_rounds, starts=self._starts())
+        if len(attack.q):
+            self.add_counterexamples(attack.q, attack.v)
+            self._look()
+        with torch.no_grad():
+            index, s, crosses = self.sample(CHECK_STATES)
+            if not len(index):
+                return 0.0, 0.0, 0.0
+            rays = self.rays.select(index)
+            fails = self.band.margin(self.params, rays, s)[0] < 0.0
+            alone = self.band.margin(self.params, rays, s, passive=False)[0] < 0.0
+            torque = float(alone.float().mean()) + found + float(len(attack.q) > 0) / CHECK_STATES
+            return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
+
+    @torch.no_grad()
+    def _look(self) -> None:
+        """Which rays cross the band now, and which of them have small margins; rays never seen are looked at."""
+        level = torch.full_like(self._noted, self.epsilon)
+        crossing = self.band.field.crosses(self.params, self.rays, level)
+        self._crossing = crossing.nonzero()[:, 0]
+        new = (crossing & torch.isinf(self._noted)).nonzero()[:, 0]
+        if len(new):
+            self._noted[new] = self.band.least_margin(self.params, self.rays.select(new))[0].clamp(max=FAR_AWAY)
+        self._near = (crossing & (self._noted < NEAR * self.margin)).nonzero()[:, 0]
+
+    def _starts(self) -> Array:
+        """Points of some of the rays of least margin, for the falsifier."""
+        least = self._crossing[self._noted[self._crossing].argsort()[: 4 * STARTS]]
+        chosen = least[torch.randperm(len(least), generator=self.generator)[:STARTS].to(self.device)]
+        rays = self.rays.select(chosen)
+        angles = self.problem.model.to_angles(rays.q.cpu().double().numpy())
+        return np.concatenate([angles, rays.d.cpu().double().numpy()], 1)
+
+    def _explore(self) -> float:
+        """New rays about those of least margin; the share of them that violate."""
+        near, count = self._near, EXPLORED // 4
+        chosen = (
+            near[torch.randint(len(near), (count // 2,), generator=self.generator).to(self.device)]
+            if len(near)
+            else near
+        )
+        rest = self._crossing[self._noted[self._crossing].argsort()[: count - len(chosen)]]
+        old = self.rays.select(torch.cat([chosen, rest]))
+        domain, model = self.problem.robot.domain, self.problem.model
+        angles = np.repeat(model.to_angles(old.q.cpu().double().numpy()), 4, 0)
+        d = np.repeat(old.d.cpu().double().numpy(), 4, 0)
+        if not len(d):
+            return 0.0
+        size = np.exp(self.rng.uniform(np.log(SPREAD[0]), np.log(SPREAD[1]), (len(d), 1)))
+        angles = angles + size * self.rng.normal(size=d.shape) * np.ptp(domain.q, axis=1)
+        d = d + size * self.rng.normal(size=d.shape) * np.ptp(domain.v, axis=1)
+        rays = self.rays_through(model.from_angles(np.clip(angles, domain.q[:, 0], domain.q[:, 1])), d)
+        least = self.band.least_margin(self.params, rays)[0]
+        small = (least < NEAR * self.margin).nonzero()[:, 0]
+        self._join(rays.select(small), least[small])
+        return float((least < 0.0).float().mean())
+
+    def _join(self, rays: Rays, margins: torch.Tensor | None = None) -> None:
+        """New rays join the pool; beyond its growth, those of largest margin leave."""
+        noted = torch.full((len(rays),), torch.inf, device=self.device) if margins is None else margins
+        self.rays, self._noted = self.rays.join(rays), torch.cat([self._noted, noted])
+        added = len(self.rays) - self._first_pool
+        if added > POOL_GROWTH:
+            order = torch.nan_to_num(self._noted[self._first_pool :], posinf=-1.0).argsort()[: POOL_GROWTH * 4 // 5]
+            kept = torch.cat(
+                [torch.arange(self._first_pool, device=self.device), self._first_pool + order.sort().values]
+            )
+            self.rays, self._noted = self.rays.select(kept), self._noted[kept]
+
+    def attack(self, params: dict[str, Array]) -> Attack:
+        """The falsifier's search against given parameters."""
+        tensors = {k: self._tensor(x) for k, x in params.items()}
+        return self.falsifier.search(tensors, rounds=self.preset.attack_rounds)
+
+    def add_counterexamples(self, q: Array, v: Array) -> None:
+        """Their rays join; they are looked at before the next iteration."""
+        if len(q) > TAKEN:
+            chosen = self.rng.choice(len(q), TAKEN, replace=False)
+            q, v = q[chosen], v[chosen]
+        self._join(self.rays_through(q, v))
+
+    def demand_more(self) -> None:
+        """A larger margin is wanted, and volume weighs less."""
+        self.margin = min(MAX_MARGIN, STRICTER * self.margin)
+        self._max_weight *= HUMBLER
+        self._simplicity *= SIMPLER
+        self._weight = self._weight.clamp(max=self._max_weight)
+        self._look()
+
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        """Rays that joined and the margins noted; weights and margin."""
+        added = self.rays.select(slice(self._first_pool, None))
+        tensors = {f"rays/{k}": x for k, x in vars(added).items()}
+        tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
+        return tensors, {"margin": self.margin, "max_weight": self._max_weight, "simplicity": self._simplicity}
+
+    def restore(self, tensors: Tensors, numbers: dict[str, Any]) -> None:
+        """See :meth:`state`."""
+        added = Rays(
+            **{k.removeprefix("rays/"): x.to(self.device) for k, x in tensors.items() if k.startswith("rays/")}
+        )
+        self.rays = self.rays.select(slice(self._first_pool)).join(added)
+        self._noted, self._weight, self._crossing, self._near = (
+            tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")
+        )
+        self.margin, self._max_weight, self._simplicity = (numbers[k] for k in ("margin", "max_weight", "simplicity"))
