@@ -53,7 +53,7 @@ class Descent(ABC):
         self.epsilon = self.band.epsilon
         self.margin = preset.margin
         self.iteration, self.planned = 0, preset.iterations
-        self.loss = float("nan")
+        self.loss: float | torch.Tensor = float("nan")  # of the last step
 
     @abstractmethod
     def iterate(self) -> None:
@@ -109,7 +109,7 @@ class Descent(ABC):
             group["lr"] = self.preset.learning_rate * max(LAST_RATE, 1.0 - self.iteration / self.preset.iterations)
 
     def sample(self, count: int, pool: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Band states at random levels of phi on random rays (of ``pool``): ray indices, s, and whether each ray crosses.
+        """Band states at random levels of phi on random rays (of ``pool``): ray indices, s, and which rays cross.
 
         Only the states that cross come back, with the mask (count,) of all.
         """

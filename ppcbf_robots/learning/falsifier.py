@@ -1,4 +1,4 @@
-"""Search for band states on which the runtime filter has no feasible torque: descent on the exact margin from many starts.
+"""Search for band states without a feasible torque for the runtime filter: descent on the exact margin, many starts.
 
 The margin is a function of q and of the direction d of v; the speed follows from the level of phi. Gradients are finite
 differences through Pinocchio and the geometry, all starts at once; the differences themselves are candidates too, so
@@ -75,7 +75,7 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Array | None = None,
     ) -> Attack:
-        """Descend from the worst of random points (or from ``starts`` (B, 2 nv)) until rounds or seconds are used up."""
+        """Descend from the worst of random points, or from ``starts`` (B, 2 nv), until rounds or seconds are used up."""
         began, evaluated, done = time.monotonic(), 0, 0
         points = self._fresh(params, STARTS) if starts is None else starts
         value = self.margins(params, points)[0]

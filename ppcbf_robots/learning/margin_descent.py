@@ -1,10 +1,11 @@
 """Descent on the exact feasibility margin of the runtime QP, for the largest set that keeps it positive.
 
-The loss is ``weight · E[-δ log s*] + E[(margin wanted - margin)₊]``: the first term moves the set's boundary outwards
-along every ray v = s d, counted relative to the ray's length so that slow motions weigh as much as fast ones; the second
-is a sum over violations, half of them drawn where the margin was smallest so far. While nothing violates, the weight
-grows and the set with it; violations shrink it. At every check the surroundings of the smallest margins are explored
-with new rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
+The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The first
+term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions weigh as
+much as fast ones. Of the second, half the states are drawn where the margin was smallest so far. The third keeps K from
+answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing violates, the weight
+grows and the set with it. At every check the surroundings of the smallest margins are explored with new rays, and the
+falsifier searches beyond; both need Pinocchio, the iterations between them do not.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ class MarginDescent(Descent):
         super().__init__(problem, kind, preset, seed, device)
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._first_pool = len(self.rays)
-        self._max_weight, self._simplicity = preset.volume_weight, preset.l2
-        self._weight = torch.tensor(preset.volume_weight, device=self.device)
+        self._max_weight, self._simplicity = preset.volume_weight, preset.simplicity
+        self._weight: torch.Tensor = torch.tensor(preset.volume_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
         self._look()
 
@@ -80,9 +81,9 @@ class MarginDescent(Descent):
         self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
 
     def _shrinkage(self, rays: Rays, s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean of -log s*, with the boundary's s* on each ray, and how much K changes along the motion, without dimensions.
+        """Mean of -log s*, of the boundary's s* on each ray, and the mean square of K's change along the motion.
 
-        The first is given up to a constant: its gradient is that of ``K / |∂phi/∂log s|``.
+        The first is given up to a constant: its gradient is that of ``K / |∂phi/∂log s|``. The second has no dimension.
         """
         v = s[:, None] * rays.d
         K, K_q_rate, K_v = self.band.field.K(self.params, rays.q, v)

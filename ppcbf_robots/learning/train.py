@@ -196,7 +196,7 @@ class Trainer:
         return max(m.volume_kept for m in last) - last[0].volume_kept < 2e-3
 
     def _evidence(self) -> list[Tested]:
-        """Judge the largest clean candidates by the filter on uniform band states and by the falsifier, until one stands."""
+        """Judge the largest clean candidates by the falsifier and by the filter on uniform states, until one stands."""
         tested = []
         for volume, params in self.clean:
             attack = self.descent.attack(params)
