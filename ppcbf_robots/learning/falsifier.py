@@ -75,7 +75,7 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Array | None = None,
     ) -> Attack:
-        """Descend from the worst of random points, or from ``starts`` (B, 2 nv), until rounds or seconds are used up."""
+        """Descend from the worst of random points, or from ``starts`` (B, 2 nv), until rounds or seconds are spent."""
         began, evaluated, done = time.monotonic(), 0, 0
         points = self._fresh(params, STARTS) if starts is None else starts
         value = self.margins(params, points)[0]

@@ -1,7 +1,7 @@
 """Descent on the exact feasibility margin of the runtime QP, for the largest set that keeps it positive.
 
-The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The first
-term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions weigh as
+The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The
+first term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions weigh as
 much as fast ones. Of the second, half the states are drawn where the margin was smallest so far. The third keeps K from
 answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing violates, the weight
 grows and the set with it. At every check the surroundings of the smallest margins are explored with new rays, and the
@@ -31,9 +31,9 @@ POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.2  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.15  # factor on the wanted margin per refinement
+STRICTER = 1.5  # factor on the wanted margin per refinement
 MAX_MARGIN = 0.3
-SIMPLER = 2.0  # factor on the penalty of what depends on q, per refinement
+SIMPLER = 1.5  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
 
