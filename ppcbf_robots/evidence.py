@@ -15,6 +15,7 @@ from ppcbf_robots.specs import Array
 CHUNK = 1000
 POWER_TOLERANCE = 5e-4  # of u_max · v_max; with 1e-3 the cart-pole's storage crept up by 2e-3 of itself
 VELOCITIES = 20  # tried per configuration
+MAX_CONFIGURATIONS = 60_000  # tried before a band counts as too thin
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,11 @@ class BandCheck:
 
 
 def uniform_band(
-    problem: Problem, barrier: Barrier, count: int, rng: np.random.Generator, max_configurations: int = 60_000
+    problem: Problem,
+    barrier: Barrier,
+    count: int,
+    rng: np.random.Generator,
+    max_configurations: int = MAX_CONFIGURATIONS,
 ) -> tuple[Array, Array, int]:
     """States uniform on ``{0 <= min_k phi_k <= epsilon, h >= 0}`` by rejection: q (n, nq), v (n, nv), states tried.
 
@@ -102,6 +107,7 @@ def check_band(
     count: int,
     rng: np.random.Generator,
     passive: bool = True,
+    max_configurations: int = MAX_CONFIGURATIONS,
 ) -> BandCheck:
     """Run the filter on uniform band states with the problem's controller and count violations.
 
@@ -109,7 +115,7 @@ def check_band(
     largest power u_max · v_max: near rest the paper's condition cannot hold exactly. QP: no torque in the box satisfies
     all rows with the passivity row (without it if not ``passive``).
     """
-    q, v, tried = uniform_band(problem, barrier, count, rng)
+    q, v, tried = uniform_band(problem, barrier, count, rng, max_configurations)
     runtime = SafetyFilter(problem.model, problem.safety, barrier, config)
     u_max = problem.model.u_max
     power_tolerance = POWER_TOLERANCE * float(u_max @ np.abs(problem.robot.domain.v).max(axis=1))
