@@ -20,7 +20,8 @@ class Preset:
     filter: FilterKind  # what the critic assumes will run; it decides how the learner descends
     metric: Metric
     learning_rate: float
-    gamma: float | None = None  # [1/s], where the robot spec gives none
+    gamma: float | None = None  # [1/s], where the robot spec gives none and X is small enough to be covered
+    covered_joints: int = 2  # up to which it is: beyond, the spec's default gamma leaves K less to learn
     units: int = 0  # convex network: number of terms
     samples: int = 1000  # N, new band states per iteration
     epochs: int = 1  # closed form: E, gradient steps per iteration
@@ -83,12 +84,14 @@ DEFAULT = Preset(
     simplicity=1.0,
     random_goals=0.5,
     rays=60_000,
-    iterations=1_000,
+    iterations=800,
+    check_every=25,
+    patience=12,
     search_rounds=8,
     refinements=8,
     refinement_share=0.3,
     test_samples=10_000,
-    attack_rounds=60,
+    attack_rounds=150,
 )
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}

@@ -264,9 +264,9 @@ def _said(tested: Tested) -> str:
 
 
 def with_gamma(problem: Problem, preset: Preset) -> Problem:
-    """The problem with the preset's gamma, where the robot spec gives none."""
+    """The problem with the preset's gamma, where the robot spec gives none and the robot has few joints."""
     spec = problem.robot.spec.barrier
-    if preset.gamma is None or "gamma" in spec.model_fields_set:
+    if preset.gamma is None or "gamma" in spec.model_fields_set or problem.model.nv > preset.covered_joints:
         return problem
     return problem.with_barrier_spec(spec.model_copy(update={"gamma": preset.gamma}))
 

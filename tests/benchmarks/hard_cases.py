@@ -103,8 +103,9 @@ def largest_lb(problem: Problem) -> tuple[float, Barrier] | None:
     for gamma in LB_GAMMAS:
         tuned = problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": gamma}))
         barrier = tuned.barrier("lb-cbf")
-        found = evidence(tuned, barrier, LB_STATES, LB_SECONDS)
-        if not found["violations"] and not found["found"]:
+        if check_band(tuned, barrier, FilterConfig(), LB_STATES, np.random.default_rng(7)).violations:
+            continue
+        if not len(falsify(tuned, barrier, FilterConfig(), np.random.default_rng(7), LB_SECONDS).q):
             return gamma, barrier
     return None
 
