@@ -30,8 +30,9 @@ app = typer.Typer(
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
     "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed, 130 stopped by Ctrl-C.",
 )
-for command in (bench, info, train, simulate, compare, view, export, convert, sweep):
+for command in (info, train, simulate, compare, view, export, convert, sweep):
     app.command()(command)
+app.add_typer(bench, name="bench")
 app.add_typer(study, name="study")
 
 

@@ -53,6 +53,7 @@ class Descent(ABC):
         self.epsilon = self.band.epsilon
         self.margin = preset.margin
         self.iteration, self.planned = 0, preset.iterations
+        self.evaluated = 0  # band states whose critics were computed in iterations
         self.loss: float | torch.Tensor = float("nan")  # of the last step
 
     @abstractmethod

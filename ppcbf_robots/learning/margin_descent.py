@@ -63,6 +63,7 @@ class MarginDescent(Descent):
         if not drawn:
             return  # the band is empty: the set has collapsed, and the checks will say so
         rays = self.rays.select(index)
+        self.evaluated += len(index)
         with torch.no_grad():
             margin = self.band.margin(self.params, rays, s)[0]
             self._noted[index] = margin

@@ -43,6 +43,7 @@ class PaperDescent(Descent):
             if not len(index):
                 break  # the band is empty: the set has collapsed, and the checks will say so
             rows, torque, passivity = self._critics(self.rays.select(index), s, self.margin)
+            self.evaluated += len(index)
             phi = rows.phi.amin(-1)
             self._step(phi, torque, passivity)
             inside = ((phi >= 0.0) & (phi <= eps)).detach()
