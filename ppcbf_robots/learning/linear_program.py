@@ -5,8 +5,8 @@ For every state b of a batch::
     max_z min_k offset_k + c_k · z    s.t.  |z_i| <= 1,  p · z <= budget
 
 is solved through its dual, ``min λ · offset + mu budget + Σ_i |(Cᵀλ - mu p)_i|`` over ``λ >= 0, Σ λ = 1, mu >= 0``, by
-the simplex method on one dense tableau per state, all of them pivoting together. It starts from the single worst row, which
-is a feasible basis, and most programs end after a handful of pivots. Works on any device, in float64.
+the simplex method on one dense tableau per state, all of them pivoting together. It starts from the single worst row,
+which is a feasible basis, and most programs end after a handful of pivots. Works on any device, in float64.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Descent on the exact feasibility margin of the runtime QP, for the largest set that keeps it positive.
 
-The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The first
-term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions weigh as
-much as fast ones. Of the second, half the states are drawn where the margin was smallest so far. The third keeps K from
-answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing violates, the weight
-grows and the set with it. At every check the surroundings of the smallest margins are explored with new rays, and the
-falsifier searches beyond; both need Pinocchio, the iterations between them do not.
+The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The
+first term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions
+weigh as much as fast ones. Of the second, half the states are drawn where the margin was smallest so far. The third
+keeps K from answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing
+violates, the weight grows and the set with it. At every check the surroundings of the smallest margins are explored
+with new rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
 """
 
 from __future__ import annotations
