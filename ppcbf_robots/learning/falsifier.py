@@ -75,12 +75,10 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Array | None = None,
     ) -> Attack:
-        """Descend from the worst of random points, or from ``starts`` (B, 2 nv), until rounds or seconds are used up."""
-        began, evaluated, done = time.monotonic(), 0, 0
-        points = self._fresh(params, STARTS) if starts is None else starts
-        value = self.margins(params, points)[0]
+        """Descend from the worst of random points, or ``starts`` (B, 2 nv), until rounds or seconds are used up."""
+        began, done = time.monotonic(), 0
+        points, value, found, evaluated = self._fresh(params, STARTS) if starts is None else self._seen(params, starts)
         step = np.full(len(points), FIRST_STEP)
-        found: list[tuple[Array, Array]] = []
         worst = float(value.min(initial=np.inf))
         while (rounds is None or done < rounds) and time.monotonic() - began < seconds and len(points):
             points, value, step, new, count = self._descend(params, points, value, step)
@@ -89,17 +87,31 @@ class Falsifier:
             evaluated, done = evaluated + count, done + 1
             spent = step < LAST_STEP
             if spent.any():
-                points[spent] = self._fresh(params, int(spent.sum()))
-                value[spent], step[spent] = self.margins(params, points[spent])[0], FIRST_STEP
+                points[spent], value[spent], new, count = self._fresh(params, int(spent.sum()))
+                step[spent], found, evaluated = FIRST_STEP, found + new, evaluated + count
+                worst = min(worst, float(value.min()))
         nq, nv = self.problem.model.nq, self.problem.model.nv
         q = np.concatenate([x for x, _ in found]) if found else np.zeros((0, nq))
         v = np.concatenate([x for _, x in found]) if found else np.zeros((0, nv))
         return Attack(worst, q, v, evaluated)
 
-    def _fresh(self, params: Mapping[str, torch.Tensor], count: int) -> Array:
-        """The worst ``count`` of random points."""
-        points = self.rng.uniform(self._low, self._high, (PROBES * count, len(self._low)))
-        return points[np.argsort(self.margins(params, points)[0])[:count]]
+    def _fresh(
+        self, params: Mapping[str, torch.Tensor], count: int
+    ) -> tuple[Array, Array, list[tuple[Array, Array]], int]:
+        """The worst ``count`` of random points, as :meth:`_seen` has them, with the states found among all of them."""
+        points, value, found, seen = self._seen(
+            params, self.rng.uniform(self._low, self._high, (PROBES * count, len(self._low)))
+        )
+        worst = np.argsort(value)[:count]
+        return points[worst], value[worst], found, seen
+
+    def _seen(
+        self, params: Mapping[str, torch.Tensor], points: Array
+    ) -> tuple[Array, Array, list[tuple[Array, Array]], int]:
+        """Points, their margins, the states of negative margin, and how many points these are."""
+        value, q, v = self.margins(params, points)
+        bad = value < 0.0
+        return points, value, [(q[bad], v[bad])] if bad.any() else [], len(points)
 
     def _descend(
         self, params: Mapping[str, torch.Tensor], points: Array, value: Array, step: Array
