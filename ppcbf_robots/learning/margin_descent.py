@@ -107,7 +107,7 @@ class MarginDescent(Descent):
             rays = self.rays.select(index)
             fails = self.band.margin(self.params, rays, s)[0] < 0.0
             alone = self.band.margin(self.params, rays, s, passive=False)[0] < 0.0
-            torque = float(alone.float().mean()) + found + float(len(attack.q) > 0) / CHECK_STATES
+            torque = max(float(alone.float().mean()), found, float(len(attack.q) > 0) / CHECK_STATES)
             return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
 
     @torch.no_grad()
