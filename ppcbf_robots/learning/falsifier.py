@@ -55,7 +55,9 @@ class Falsifier:
 
     def margins(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
         """Least margins (B,) of points (B, 2 nv) of angles and directions, infinite off the band, and states q, v."""
-        nv = self.problem.model.nv
+        nq, nv = self.problem.model.nq, self.problem.model.nv
+        if not len(points):
+            return np.zeros(0), np.zeros((0, nq)), np.zeros((0, nv))
         q = self.problem.model.from_angles(points[:, :nv])
         arrays, _, free = rays_at(self.problem, q, points[:, nv:], self.rows)
         device, dtype = self.band.u_max.device, self.band.u_max.dtype
