@@ -126,7 +126,8 @@ class Falsifier:
         tried = np.clip(tried, self._low, self._high)
         near, q, v = self.margins(params, tried.reshape(B * n, n))
         near = near.reshape(B, n)
-        slope = np.where(np.isfinite(near) & np.isfinite(value)[:, None], (near - value[:, None]) * sign, 0.0)
+        known = np.isfinite(near) & np.isfinite(value)[:, None]
+        slope = sign * np.subtract(near, value[:, None], out=np.zeros_like(near), where=known)
         direction = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
         strides = np.array(STRIDES)[None, :, None] * step[:, None, None] * direction[:, None] * self._width
         along = np.clip(points[:, None] + strides, self._low, self._high)
