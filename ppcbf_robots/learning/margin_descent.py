@@ -54,6 +54,9 @@ class MarginDescent(Descent):
         """A batch of band states, half of them where margins are small; one step; the weight's update."""
         p = self.preset
         self.set_rate()
+        if not len(self._crossing):
+            self.iteration += 1
+            return  # the band is empty: the set has collapsed, and the checks will say so
         index, s, _ = self.sample(p.samples, self._crossing)
         drawn = len(index)
         if len(self._near):
@@ -61,7 +64,7 @@ class MarginDescent(Descent):
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
-            return  # the band is empty: the set has collapsed, and the checks will say so
+            return
         rays = self.rays.select(index)
         with torch.no_grad():
             margin = self.band.margin(self.params, rays, s)[0]
