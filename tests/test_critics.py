@@ -262,11 +262,16 @@ def test_the_gradient_of_the_feasibility_margin(rows, passive):
     np.testing.assert_allclose((Lf.grad > 0.0).sum(-1)[possible] >= 1, True)
 
 
-@pytest.mark.parametrize("passive", [True, False])
-def test_the_margin_is_negative_exactly_where_the_runtime_filter_has_no_answer(problem, random_network, passive):
-    """On uniform band states of a random network, with weak motors, so that both are common."""
+@pytest.mark.parametrize(("passive", "strength"), [(True, 0.1), (False, 0.01)])
+def test_the_margin_is_negative_exactly_where_the_runtime_filter_has_no_answer(
+    problem, random_network, monkeypatch, passive, strength
+):
+    """On uniform band states of a random steep network, with weak motors, so that both are common."""
     model = problem.model
+    monkeypatch.setattr(model, "u_max", strength * model.u_max)
     network = random_network("convex", model.nq, model.nv, seed=1)
+    for name in ("W0", "Wb"):
+        network.params[name] *= 5.0
     barrier, config = problem.barrier("pp-ncbf", network), FilterConfig()
     q, v, _ = uniform_band(problem, barrier, 150, np.random.default_rng(0), 20_000)
     arrays, _, free = rays_at(problem, q, v, 1000)
@@ -274,7 +279,7 @@ def test_the_margin_is_negative_exactly_where_the_runtime_filter_has_no_answer(p
     rays = Rays(**to_tensors([arrays], CPU, DOUBLE))
     s = torch.as_tensor(np.linalg.norm(v, axis=1) / np.linalg.norm(arrays["d"], axis=1))
     band = Band(problem, "convex", config, passive, CPU, DOUBLE)
-    margin, rows = band.margin(tensors(network.params), rays, s)
+    margin = band.margin(tensors(network.params), rays, s)[0]
     runtime = SafetyFilter(model, problem.safety, barrier, config)
     failed = np.zeros(len(q), dtype=bool)
     for i in range(len(q)):
@@ -285,8 +290,7 @@ def test_the_margin_is_negative_exactly_where_the_runtime_filter_has_no_answer(p
     clear = margin.abs().numpy() > 1e-5
     assert clear.mean() > 0.95
     np.testing.assert_array_equal((margin.numpy() < 0.0)[clear], failed[clear])
-    print(problem.robot.name, failed.mean())
-    assert rows.phi.shape[0] == len(q)
+    assert failed.any() and not failed.all()
 
 
 def test_near_rest_the_band_asks_for_no_passivity(two_link, random_network):
