@@ -166,6 +166,18 @@ def test_the_best_worst_row_is_that_of_a_linear_programming_solver(kind, n, rows
         assert dual(offset, c, p, budget, share[i]) == pytest.approx(value[i], abs=1e-7)
 
 
+@pytest.mark.parametrize("kind", ["zero rows", "opposite rows"])
+@pytest.mark.parametrize(("n", "rows"), [(7, 8), (8, 16)])
+def test_rounding_does_not_break_one_program_in_thousands(n, rows, kind):
+    """Pivots that are noise must not be taken: z is feasible and attains the value that the share proves."""
+    offset, c, p, budget = (torch.as_tensor(x) for x in programs(n, rows, 1, kind, count=10_000))
+    value, _, z = best_worst_row(offset, c, p, budget)
+    assert ((p * z).sum(-1) - budget).max() <= 1e-8
+    assert z.abs().max() <= 1.0 + 1e-8
+    attained = (offset + (c * z[:, None]).sum(-1)).amin(-1)
+    np.testing.assert_allclose(attained, value, atol=1e-8)
+
+
 def test_programs_of_one_batch_do_not_see_each_other():
     states = [torch.as_tensor(x) for x in programs(5, 9, 0, "any", count=30)]
     together = best_worst_row(*states)
