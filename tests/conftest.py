@@ -125,6 +125,17 @@ def make_barrier(random_network: Callable[..., NumpyNetwork]) -> Callable[..., B
     return build
 
 
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """PyTorch with one thread: on a busy machine more only wait for each other."""
+    import torch  # takes seconds: only where it is needed
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(params=BARRIERS)
 def barrier_name(request: pytest.FixtureRequest) -> str:
     """Each barrier in turn, the learned ones with both forms of network."""

@@ -66,7 +66,8 @@ def small_presets() -> Iterator[None]:
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         for name, preset in PRESETS.items():
-            small = {"rays": 1000, "samples": 100, "top": 20, "hidden": (16, 16), "test_samples": 200}
+            small = {"rays": 1000, "samples": 100, "top": 20, "hidden": (16, 16), "test_samples": 200,
+                     "search_rounds": 1, "attack_rounds": 2}  # fmt: skip
             patch.setitem(PRESETS, name, dataclasses.replace(preset, **small))
         yield
     torch.set_num_threads(threads)
@@ -187,7 +188,7 @@ def test_info_warns_of_a_start_and_goal_in_an_obstacle(tmp_path):
 
 def test_train(training, barrier):
     assert set(training) == {"converged", "reason", "volume_kept", "violations", "samples", "start_inside", "seconds",
-                             "steps", "preset", "seed", "device", "kind", "iterations", "out"}  # fmt: skip
+                             "worst_margin", "attacked", "steps", "preset", "seed", "device", "kind", "iterations", "out"}  # fmt: skip
     assert (training["converged"], training["violations"], training["start_inside"]) == (True, 0, True)
     assert (training["samples"], training["steps"]) == (200, 50)
     assert 0.9 < training["volume_kept"] <= 1.0

@@ -14,6 +14,8 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.learning.train import Monitor, Trainer
 
 FILE = "checkpoint.safetensors"
+FORMAT = 2  # of the file; one of another format belongs to another version
+AGAIN = "train from the start without --resume"
 
 
 def save_checkpoint(trainer: Trainer, folder: Path) -> None:
@@ -30,6 +32,7 @@ def save_checkpoint(trainer: Trainer, folder: Path) -> None:
         tensors |= {f"clean/{j}/{k}": torch.as_tensor(x) for k, x in params.items()}
         tensors[f"clean/{j}/volume"] = torch.tensor(volume)
     state = {
+        "format": FORMAT,
         "identity": trainer.identity(),
         "iteration": descent.iteration,
         "planned": descent.planned,
@@ -50,7 +53,7 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
     """Continue from a folder's checkpoint.
 
     Raises:
-        InputError: if there is none, or it belongs to another problem, preset or seed.
+        InputError: if there is none, or it belongs to another version, problem, preset or seed.
     """
     path = folder / FILE
     if not path.is_file():
@@ -60,12 +63,16 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
             state = json.loads(file.metadata()["state"])
             tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - not a dict
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not a checkpoint ({error}); train from the start without --resume") from None
+        raise InputError(f"{path}: not a checkpoint ({error}); {AGAIN}") from None
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise InputError(f"{path}: a checkpoint of another version; {AGAIN}")
     if state["identity"] != trainer.identity():
         raise InputError(
             f"{path}: belongs to another robot, world, preset, barrier or seed; resume with the same options"
         )
     descent = trainer.descent
+    if any(getattr(tensors.get(f"param/{k}"), "shape", None) != x.shape for k, x in descent.params.items()):
+        raise InputError(f"{path}: a checkpoint of another version, its network has another form; {AGAIN}")
     for k in descent.trained:
         with torch.no_grad():
             descent.params[k].copy_(tensors[f"param/{k}"])

@@ -14,15 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.band import Band
 from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
-from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
-ROWS = 16  # nearest rows that a barrier as it runs is judged by
 STARTS = 48  # searched from at once
 PROBES = 40  # random points for every start, of which the worst is taken
 FIRST_STEP = 0.02  # of X's width, of the finite differences
@@ -59,7 +55,9 @@ class Falsifier:
 
     def margins(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
         """Least margins (B,) of points (B, 2 nv) of angles and directions, infinite off the band, and states q, v."""
-        nv = self.problem.model.nv
+        nq, nv = self.problem.model.nq, self.problem.model.nv
+        if not len(points):
+            return np.zeros(0), np.zeros((0, nq)), np.zeros((0, nv))
         q = self.problem.model.from_angles(points[:, :nv])
         arrays, _, free = rays_at(self.problem, q, points[:, nv:], self.rows)
         device, dtype = self.band.u_max.device, self.band.u_max.dtype
@@ -79,12 +77,10 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Array | None = None,
     ) -> Attack:
-        """Descend from the worst of random points, or from ``starts`` (B, 2 nv), until rounds or seconds are spent."""
-        began, evaluated, done = time.monotonic(), 0, 0
-        points = self._fresh(params, STARTS) if starts is None else starts
-        value = self.margins(params, points)[0]
+        """Descend from the worst of random points, or ``starts`` (B, 2 nv), until rounds or seconds are used up."""
+        began, done = time.monotonic(), 0
+        points, value, found, evaluated = self._fresh(params, STARTS) if starts is None else self._seen(params, starts)
         step = np.full(len(points), FIRST_STEP)
-        found: list[tuple[Array, Array]] = []
         worst = float(value.min(initial=np.inf))
         while (rounds is None or done < rounds) and time.monotonic() - began < seconds and len(points):
             points, value, step, new, count = self._descend(params, points, value, step)
@@ -93,17 +89,31 @@ class Falsifier:
             evaluated, done = evaluated + count, done + 1
             spent = step < LAST_STEP
             if spent.any():
-                points[spent] = self._fresh(params, int(spent.sum()))
-                value[spent], step[spent] = self.margins(params, points[spent])[0], FIRST_STEP
+                points[spent], value[spent], new, count = self._fresh(params, int(spent.sum()))
+                step[spent], found, evaluated = FIRST_STEP, found + new, evaluated + count
+                worst = min(worst, float(value.min()))
         nq, nv = self.problem.model.nq, self.problem.model.nv
         q = np.concatenate([x for x, _ in found]) if found else np.zeros((0, nq))
         v = np.concatenate([x for _, x in found]) if found else np.zeros((0, nv))
         return Attack(worst, q, v, evaluated)
 
-    def _fresh(self, params: Mapping[str, torch.Tensor], count: int) -> Array:
-        """The worst ``count`` of random points."""
-        points = self.rng.uniform(self._low, self._high, (PROBES * count, len(self._low)))
-        return points[np.argsort(self.margins(params, points)[0])[:count]]
+    def _fresh(
+        self, params: Mapping[str, torch.Tensor], count: int
+    ) -> tuple[Array, Array, list[tuple[Array, Array]], int]:
+        """The worst ``count`` of random points, as :meth:`_seen` has them, with the states found among all of them."""
+        points, value, found, seen = self._seen(
+            params, self.rng.uniform(self._low, self._high, (PROBES * count, len(self._low)))
+        )
+        worst = np.argsort(value)[:count]
+        return points[worst], value[worst], found, seen
+
+    def _seen(
+        self, params: Mapping[str, torch.Tensor], points: Array
+    ) -> tuple[Array, Array, list[tuple[Array, Array]], int]:
+        """Points, their margins, the states of negative margin, and how many points these are."""
+        value, q, v = self.margins(params, points)
+        bad = value < 0.0
+        return points, value, [(q[bad], v[bad])] if bad.any() else [], len(points)
 
     def _descend(
         self, params: Mapping[str, torch.Tensor], points: Array, value: Array, step: Array
@@ -117,7 +127,7 @@ class Falsifier:
         near, q, v = self.margins(params, tried.reshape(B * n, n))
         near = near.reshape(B, n)
         known = np.isfinite(near) & np.isfinite(value)[:, None]
-        slope = np.subtract(near, value[:, None], where=known, out=np.zeros_like(near)) * sign
+        slope = sign * np.subtract(near, value[:, None], out=np.zeros_like(near), where=known)
         direction = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
         strides = np.array(STRIDES)[None, :, None] * step[:, None, None] * direction[:, None] * self._width
         along = np.clip(points[:, None] + strides, self._low, self._high)
@@ -132,31 +142,3 @@ class Falsifier:
         found = [(q[bad], v[bad]), (q_far[bad_far], v_far[bad_far])]
         return (points, np.where(better, values[start, best], value), np.where(better, step, 0.5 * step),
                 [f for f in found if len(f[0])], values.size)  # fmt: skip
-
-
-def falsify(
-    problem: Problem, barrier: Barrier, config: FilterConfig, rng: np.random.Generator, seconds: float
-) -> Attack:
-    """Search against a barrier as it runs, in float64: an LB-CBF, NCBF or PP-NCBF with the QP filter.
-
-    Args:
-        problem: robot, world and controller; gamma is the barrier's.
-        barrier: with or without a network.
-        config: settings of the QP filter.
-        rng: source of randomness.
-        seconds: how long to search.
-    """
-    problem = problem.with_barrier_spec(barrier.spec)
-    network = getattr(barrier, "network", None) or NumpyNetwork("convex", no_network(problem))
-    device, dtype = torch.device("cpu"), torch.float64
-    band = Band(problem, network.kind, config, barrier.kind != "ncbf", device, dtype)
-    params = {k: torch.as_tensor(w, dtype=dtype) for k, w in network.params.items()}
-    return Falsifier(problem, band, ROWS, rng).search(params, seconds=seconds)
-
-
-def no_network(problem: Problem) -> dict[str, Array]:
-    """Parameters of a convex form that is zero everywhere: no units."""
-    nq, nv = problem.model.nq, problem.model.nv
-    shapes = {"in_shift": nq, "in_scale": nq, "turns": nq, "v_scale": nv, "ba": 0, "bb": 0, "bc": 0}
-    heads = {name: np.zeros((3 * nq, 0)) for name in ("Wa", "Wb", "Wc")}
-    return {name: np.zeros(size) for name, size in shapes.items()} | heads

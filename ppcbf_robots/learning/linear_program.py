@@ -17,6 +17,7 @@ import torch
 
 PIVOTS = 60  # more than any program of 8 joints and 16 rows was seen to need
 _TOLERANCE = 1e-10
+_TIE = 1e-11
 
 
 class Optimum(NamedTuple):
@@ -50,7 +51,8 @@ def best_worst_row(offset: torch.Tensor, c: torch.Tensor, p: torch.Tensor, budge
         steep = column[:, : n + 1] > _TOLERANCE
         ratio = torch.where(steep, T[:, : n + 1, columns].clamp(min=0.0) / torch.where(steep, column[:, : n + 1], 1.0),
                             torch.inf)  # fmt: skip
-        leaving = ratio.argmin(-1)
+        tied = ratio <= ratio.amin(-1, keepdim=True) + _TIE  # of these the largest pivot: a tiny one is rounding noise
+        leaving = torch.where(tied, column[:, : n + 1], 0.0).argmax(-1)
         pivot = column[batch, leaving]
         row = T[batch, leaving] / torch.where(improves, pivot, 1.0)[:, None]
         factor = column.clone()

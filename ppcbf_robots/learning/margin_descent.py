@@ -3,9 +3,9 @@
 The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The
 first term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions
 weigh as much as fast ones. Of the second, half the states are drawn where the margin was smallest so far. The third
-keeps K from answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing violates,
-the weight grows and the set with it. At every check the surroundings of the smallest margins are explored with new
-rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
+keeps K from answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing
+violates, the weight grows and the set with it. At every check the surroundings of the smallest margins are explored
+with new rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
 """
 
 from __future__ import annotations
@@ -54,6 +54,9 @@ class MarginDescent(Descent):
         """A batch of band states, half of them where margins are small; one step; the weight's update."""
         p = self.preset
         self.set_rate()
+        if not len(self._crossing):
+            self.iteration += 1
+            return  # the band is empty: the set has collapsed, and the checks will say so
         index, s, _ = self.sample(p.samples, self._crossing)
         drawn = len(index)
         if len(self._near):
@@ -61,7 +64,7 @@ class MarginDescent(Descent):
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
-            return  # the band is empty: the set has collapsed, and the checks will say so
+            return
         rays = self.rays.select(index)
         self.evaluated += len(index)
         with torch.no_grad():
@@ -108,7 +111,7 @@ class MarginDescent(Descent):
             rays = self.rays.select(index)
             fails = self.band.margin(self.params, rays, s)[0] < 0.0
             alone = self.band.margin(self.params, rays, s, passive=False)[0] < 0.0
-            torque = float(alone.float().mean()) + found + float(len(attack.q) > 0) / CHECK_STATES
+            torque = max(float(alone.float().mean()), found, float(len(attack.q) > 0) / CHECK_STATES)
             return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
 
     @torch.no_grad()

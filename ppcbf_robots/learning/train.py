@@ -63,13 +63,14 @@ class Result:
 
     def report(self) -> dict[str, Any]:
         """The keys of ``ppcbf train --json``, without the folder."""
+        worst = np.inf if self.attack is None else self.attack.worst
         return {
             "converged": self.converged,
             "reason": self.reason,
             "volume_kept": round(self.volume_kept, 5),
             "violations": self.check.violations,
             "samples": self.check.samples,
-            "worst_margin": None if self.attack is None else round(self.attack.worst, 6),
+            "worst_margin": round(worst, 6) if np.isfinite(worst) else None,
             "attacked": 0 if self.attack is None else self.attack.evaluated,
             "start_inside": self.start_inside,
             "seconds": round(self.seconds, 2),

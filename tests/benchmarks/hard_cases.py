@@ -1,9 +1,9 @@
 """The default preset where torque is short: cart-pole at 8 N, two-link at ±4 rad/s, a weak Panda, a UR5 with 4 kg.
 
 Each case is trained with the one default preset, then judged by 100,000 fresh uniform band states given to the runtime
-filter and by 60 s of the falsifier. Volumes are shares of X: of the barrier's set, of the largest LB set that the same
-evidence passes (gamma tuned over a grid, fewer states), and in 4-D of the largest viable set. One JSON object per case
-is appended to the output; cases already there are skipped.
+filter and by 60 s of the falsifier. Volumes are shares of X: of the barrier's set, and of the largest LB set that the
+same evidence passes (gamma tuned over a grid, fewer states); ``ppcbf study safe-set`` gives that of the viable set. One
+JSON object per case is appended to the output; cases already there are skipped.
 
 Run: ``python tests/benchmarks/hard_cases.py --out runs/hard.jsonl``, then ``--table`` for the README's table.
 """
@@ -31,8 +31,7 @@ from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.falsifier import falsify
 from ppcbf_robots.problem import Problem, load_robot
 from ppcbf_robots.resources import find_robot
-from ppcbf_robots.safe_sets import FREE, VIABLE, membership
-from ppcbf_robots.viability import solve
+from ppcbf_robots.safe_sets import FREE, membership
 
 Spec = dict[str, Any]
 LB_GAMMAS = (20.0, 15.0, 10.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)  # [1/s], tried from above
@@ -127,22 +126,19 @@ def case(name: str, folder: Path, states: int, seconds: float) -> Spec:
     facts |= evidence(problem, barrier, states, seconds)
     lb = largest_lb(problem)
     sets = {"trained": barrier} | ({} if lb is None else {"lb": lb[1]})
-    viable = solve(problem) if problem.model.nv == 2 else None
-    volumes = membership(problem, sets, viable, VOLUME_STATES, np.random.default_rng(1))
+    volumes = membership(problem, sets, None, VOLUME_STATES, np.random.default_rng(1))
     names = {"free": FREE, "volume": "trained"} | ({} if lb is None else {"lb_volume": "lb"})
-    names |= {} if viable is None else {"viable": VIABLE}
     facts |= {k: round(volumes.ratio(n).value, 4) for k, n in names.items()}
     return facts | {"lb_gamma": None if lb is None else lb[0]}
 
 
 def table(path: Path) -> None:
     """The README's table from the output file."""
-    print("| case | gamma | set / X | largest LB / X (gamma) | viable / X | violations | worst margin in 60 s "
-          "| trained, CPU |\n|---|---|---|---|---|---|---|---|")  # fmt: skip
+    print("| case | gamma | set / X | largest LB / X (gamma) | violations | worst margin in 60 s | trained, CPU |"
+          "\n|---|---|---|---|---|---|---|")  # fmt: skip
     for c in map(json.loads, path.read_text().splitlines()):
         lb = f"{c['lb_volume']:.1%} ({c['lb_gamma']:g})" if c["lb_gamma"] else "none"
-        viable = f"{c['viable']:.1%}" if "viable" in c else "-"
-        print(f"| {c['case']}, {c['world']} | {c['gamma']:g} | {c['volume']:.1%} | {lb} | {viable} "
+        print(f"| {c['case']}, {c['world']} | {c['gamma']:g} | {c['volume']:.1%} | {lb} "
               f"| {c['violations']} of {c['samples']} | {c['worst_margin']:.3f} | {c['cpu_s']:.0f} s |")  # fmt: skip
 
 

@@ -1,0 +1,154 @@
+"""The search for states without a feasible torque: what it finds is real, and it finds what was planted."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.learning import falsifier as module
+from ppcbf_robots.learning.band import Band
+from ppcbf_robots.learning.falsifier import STARTS, Attack, Falsifier
+from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
+from ppcbf_robots.network import NumpyNetwork, random_convex
+from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.safety_filter import SafetyFilter
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def weak(tmp_path: Path, cartpole: Problem) -> Problem:
+    """The cart-pole with motors of 8 N, for which a quarter of the LB band is infeasible."""
+    urdf = cartpole.model.urdf
+    spec = tmp_path / "weak.yaml"
+    spec.write_text((urdf.parent / "cartpole.yaml").read_text().replace(urdf.name, str(urdf)) + "effort: 8\n")
+    return load_problem(str(spec), "wall")
+
+
+def nothing_learned(problem: Problem) -> dict[str, Any]:
+    """Parameters with K = 0: the LB barrier."""
+    model = problem.model
+    params = random_convex(model.nq, model.nv, (8,), 2, np.random.default_rng(0))
+    return params | {"ba": np.full(2, -1e3)}
+
+
+def make(problem: Problem, seed: int = 0, passive: bool = True, dtype: torch.dtype = torch.float64) -> Falsifier:
+    band = Band(problem, "convex", FilterConfig(), passive, CPU, dtype)
+    return Falsifier(problem, band, 8, np.random.default_rng(seed))
+
+
+def attack(problem: Problem, seed: int = 0, passive: bool = True, **limits: Any) -> Attack:
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(problem).items()}
+    return make(problem, seed, passive).search(params, **limits)
+
+
+def statuses(problem: Problem, q: Any, v: Any, passive: bool = True) -> list[Status]:
+    """What the filter that will run says of states."""
+    barrier = problem.barrier("pp-ncbf", NumpyNetwork("convex", nothing_learned(problem)))
+    runtime = SafetyFilter(problem.model, problem.safety, barrier, FilterConfig())
+    found = []
+    for qi, vi in zip(q, v, strict=True):
+        dyn = problem.model.evaluate(qi, vi)
+        nominal = problem.robot.controller.evaluate(dyn)
+        found.append(runtime.filter(0.0, dyn, nominal.u, float(nominal.d_p) if passive else None).status)
+    return found
+
+
+def margins(problem: Problem, q: Any, v: Any) -> np.ndarray:
+    """Margins of states themselves, with all rows."""
+    arrays, _, free = rays_at(problem, q, v, 1000)
+    assert free.all()
+    rays = Rays(**to_tensors([arrays], CPU, torch.float64))
+    s = torch.as_tensor(np.linalg.norm(v, axis=1) / np.linalg.norm(arrays["d"], axis=1))
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(problem).items()}
+    return np.asarray(make(problem).band.margin(params, rays, s)[0])
+
+
+@pytest.mark.parametrize("passive", [True, False])
+def test_a_planted_violation_is_found_and_is_one_for_the_runtime_filter(weak, passive):
+    found = attack(weak, passive=passive, rounds=2)
+    assert found.worst < -1.0
+    assert len(found.q) == len(found.v) > 50
+    assert found.evaluated > 2 * STARTS
+    some = np.random.default_rng(0).choice(len(found.q), 100)
+    assert min(statuses(weak, found.q[some], found.v[some], passive)) >= Status.PASSIVITY_DROPPED
+    dyn = weak.model.evaluate_batch(found.q, found.v)
+    safety = weak.safety.evaluate(dyn)
+    phi = weak.barrier("lb-cbf").rows(dyn, safety).phi.min(-1)
+    assert safety.h.min() >= 0.0
+    assert phi.min() > -0.01 and phi.max() < weak.robot.spec.barrier.epsilon + 0.01
+
+
+def test_it_also_finds_what_few_states_of_the_band_violate(panda):
+    """The Panda's LB barrier drops passivity somewhere."""
+    found = attack(panda, rounds=3)
+    assert found.worst < 0.0
+    clear = margins(panda, found.q, found.v) < -1e-6
+    assert clear.mean() > 0.9
+    assert min(statuses(panda, found.q[clear], found.v[clear])) >= Status.PASSIVITY_DROPPED
+
+
+def test_nothing_is_found_where_there_is_torque_enough(two_link):
+    found = attack(two_link, rounds=4)
+    assert found.worst > 0.1
+    assert found.q.shape == found.v.shape == (0, 2)
+
+
+@pytest.mark.parametrize("rounds", [0, 1, 5])
+def test_the_worst_is_the_least_margin_of_what_is_returned(weak, rounds):
+    """The points it starts from included."""
+    found = attack(weak, rounds=rounds)
+    assert len(found.q)
+    assert margins(weak, found.q, found.v).min() == pytest.approx(found.worst, rel=1e-6)
+
+
+def test_descent_goes_below_the_random_points(two_link):
+    start, end = (attack(two_link, rounds=rounds) for rounds in (0, 10))
+    assert end.worst < start.worst - 0.005
+    assert end.evaluated > start.evaluated > 0
+
+
+def test_points_that_are_spent_are_replaced_and_count(weak, monkeypatch):
+    monkeypatch.setattr(module, "LAST_STEP", 1.0)  # all of them in every round
+    found, without = attack(weak, rounds=3), attack(weak, rounds=0)
+    assert found.evaluated > 4 * without.evaluated - 1
+    assert margins(weak, found.q, found.v).min() == pytest.approx(found.worst, rel=1e-6)
+
+
+def test_a_seed_repeats_a_search(weak):
+    first, second, other = (attack(weak, seed, rounds=3) for seed in (1, 1, 2))
+    for x, y in zip(dataclasses.astuple(first), dataclasses.astuple(second), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert first.worst != other.worst
+
+
+def test_it_ends_in_time(weak):
+    began = time.monotonic()
+    attack(weak, seconds=0.5)
+    assert 0.5 <= time.monotonic() - began < 5.0
+    assert attack(weak, seconds=0.0, rounds=1000).evaluated == attack(weak, rounds=0).evaluated
+
+
+def test_it_starts_where_it_is_told_to(weak):
+    """At points in collision or that never reach the band there is nothing to descend on."""
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(weak).items()}
+    falsifier, domain = make(weak), weak.robot.domain
+    bad = attack(weak, rounds=0)
+    starts = np.hstack([weak.model.to_angles(bad.q), bad.v])[:10]
+    given = starts.copy()
+    found = falsifier.search(params, rounds=0, starts=starts)
+    assert (found.evaluated, len(found.q)) == (10, 10)
+    np.testing.assert_array_equal(starts, given)
+    away = np.hstack([domain.q[:, :1].T, np.array([[-4.0, 0.0]])])
+    least, _, v = falsifier.margins(params, away)
+    assert np.isinf(least[0]) and not v.any()
+    nothing = falsifier.search(params, rounds=3, starts=np.zeros((0, 4)))
+    assert (nothing.worst, len(nothing.q), nothing.evaluated) == (np.inf, 0, 0)

@@ -1,0 +1,148 @@
+"""Rays in velocity space against Pinocchio and the runtime barrier."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ppcbf_robots.barriers import BarrierRows
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.learning.presets import DEFAULT
+from ppcbf_robots.learning.rays import FAR, Field, Rays, build_pool, rays_at, to_tensors
+from ppcbf_robots.learning.train import Trainer
+from ppcbf_robots.network import NumpyNetwork
+from ppcbf_robots.problem import Problem, load_problem
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CPU, DOUBLE = torch.device("cpu"), torch.float64
+
+
+@pytest.fixture(params=["mlp", "convex"])
+def network(request, problem, random_network) -> NumpyNetwork:
+    """Random weights of both forms for each problem."""
+    return random_network(request.param, problem.model.nq, problem.model.nv, seed=1)
+
+
+def tensors(params: dict[str, Any]) -> dict[str, torch.Tensor]:
+    return {k: torch.as_tensor(x, dtype=DOUBLE) for k, x in params.items()}
+
+
+def draw(problem: Problem, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform states of X."""
+    rng, domain = np.random.default_rng(seed), problem.robot.domain
+    return problem.model.from_angles(domain.sample_q(rng, count)), domain.sample_v(rng, count)
+
+
+def make_rays(problem: Problem, count: int = 200, rows: int = 1000, seed: int = 0) -> Rays:
+    """Free rays in double precision, with all rows unless fewer are asked for."""
+    arrays, _, free = rays_at(problem, *draw(problem, count, seed), rows)
+    return Rays(**to_tensors([{k: x[free] for k, x in arrays.items()}], CPU, DOUBLE))
+
+
+def make_field(problem: Problem, kind: str) -> Field:
+    return Field(problem.model, kind, problem.robot.spec.barrier.gamma, CPU, DOUBLE)
+
+
+def runtime_rows(problem: Problem, network: NumpyNetwork, q: Any, v: Any) -> BarrierRows:
+    """All rows of the barrier that will run, through Pinocchio."""
+    dyn = problem.model.evaluate_batch(np.asarray(q), np.asarray(v))
+    return problem.barrier("pp-ncbf", network).rows(dyn, problem.safety.evaluate(dyn))
+
+
+def test_rows_along_a_ray_are_those_of_the_runtime_barrier(problem, network):
+    rays = make_rays(problem)
+    s = torch.rand(len(rays), generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    found = make_field(problem, network.kind).rows(tensors(network.params), rays, s)
+    expected = runtime_rows(problem, network, rays.q, s[:, None] * rays.d)
+    orders = [np.argsort(np.asarray(rows.phi), axis=-1) for rows in (found, expected)]
+    for name in ("phi", "h", "Lf_phi", "Lg_phi", "w"):
+        sorted_ = []
+        for rows, order in zip((found, expected), orders, strict=True):
+            x = np.asarray(getattr(rows, name))
+            sorted_.append(np.take_along_axis(x, order[..., None] if x.ndim == 3 else order, 1))
+        scale = max(1.0, float(np.abs(sorted_[1]).max()))
+        np.testing.assert_allclose(sorted_[0], sorted_[1], rtol=0.0, atol=1e-9 * scale, err_msg=name)
+
+
+def test_rays_hold_the_nominal_torque_and_reach_the_face_of_the_box(problem):
+    q, v = draw(problem, 100)
+    goals = problem.robot.domain.sample_q(np.random.default_rng(3), 100)
+    ray, least_rho, free = rays_at(problem, q, v, 3, goals)
+    np.testing.assert_array_equal(q, ray["q"])
+    box = problem.robot.domain.v
+    reach = np.where(ray["d"] >= 0.0, ray["d"] / box[:, 1], ray["d"] / box[:, 0]).max(axis=1)
+    np.testing.assert_allclose(reach, 1.0, atol=1e-12)
+    for i, goal in zip(range(20), goals, strict=False):
+        dyn = problem.model.evaluate(ray["q"][i], 0.5 * ray["d"][i])
+        nominal = problem.robot.controller.with_goal(problem.model.from_angles(goal)).evaluate(dyn)
+        u = ray["u_rest"][i] - problem.robot.controller.gains.kd * dyn.v
+        np.testing.assert_allclose(u, nominal.u, atol=1e-9)
+        safety = problem.safety.evaluate(problem.model.evaluate(q[i], v[i]))
+        assert free[i] == (safety.h.min() >= 0.0)
+        rho = safety.grad @ v[i] + problem.robot.spec.barrier.gamma * safety.h
+        assert least_rho[i] == pytest.approx(rho.min(), abs=1e-9)
+
+
+def test_bisection_lands_on_the_level(problem, network):
+    field, rays, params = make_field(problem, network.kind), make_rays(problem, 400), tensors(network.params)
+    level = torch.rand(len(rays), generator=torch.Generator().manual_seed(0), dtype=DOUBLE) * 0.05
+    s, crosses = field.on_band(params, rays, level)
+    assert crosses.double().mean() > 0.02
+    assert torch.all((s >= 0.0) & (s <= 1.0))
+    phi = runtime_rows(problem, network, rays.q, s[:, None] * rays.d).phi.min(-1)
+    error = np.abs(phi - level.numpy())[crosses]
+    assert (np.median(error) < 5e-4) and (np.quantile(error, 0.98) < 5e-3) and (error.max() < 0.02)
+    ends = [runtime_rows(problem, network, rays.q, x * rays.d).phi.min(-1) for x in (0.0, 1.0)]
+    np.testing.assert_array_equal(crosses, (ends[0] >= level.numpy()) & (ends[1] < level.numpy()))
+
+
+@pytest.mark.parametrize("world", ["sphere", "five_spheres"])
+def test_a_few_near_rows_decide_on_the_band(world, random_network):
+    """With K = 0 bisection is exact but for kinks; of the Panda's rows six nearly always hold the least one there."""
+    problem = load_problem("panda", world)
+    params = random_network("mlp", problem.model.nq, problem.model.nv).params
+    params["w_out"] = np.zeros_like(params["w_out"])
+    rays, field = make_rays(problem, 2000, rows=6), make_field(problem, "mlp")
+    s, crosses = field.on_band(tensors(params), rays, torch.full((len(rays),), 0.025, dtype=DOUBLE))
+    phi = runtime_rows(problem, NumpyNetwork("mlp", params), rays.q, s[:, None] * rays.d).phi.min(-1)[crosses]
+    assert crosses.sum() > 100
+    assert (phi < 0.025 - 1e-9).mean() < 0.01
+    assert (np.abs(phi - 0.025) < 1e-9).mean() > 0.9
+
+
+def test_only_rows_that_stay_far_are_dropped(panda):
+    gamma = panda.robot.spec.barrier.gamma
+    rays = make_rays(panda, 500)
+    fewer = rays.without_far_rows(gamma)
+    count = fewer.h.shape[1]
+    assert 0 < count < rays.h.shape[1]
+    assert fewer.grad.shape[1] == fewer.eta.shape[1] == count
+    dropped = gamma * rays.h[:, count:] - torch.relu(-(rays.grad @ rays.d[..., None])[..., 0])[:, count:]
+    assert dropped.min() > FAR
+
+
+def test_pools_join_and_select(two_link):
+    a, b = make_rays(two_link, 20), make_rays(two_link, 20, seed=1)
+    both = a.join(b)
+    assert len(both) == len(a) + len(b)
+    for field in dataclasses.fields(Rays):
+        picked = getattr(both.select(torch.tensor([len(a), 0])), field.name)
+        assert torch.equal(picked, torch.stack([getattr(b, field.name)[0], getattr(a, field.name)[0]]))
+
+
+def test_the_pool_is_as_large_as_asked_for(two_link):
+    rays, volume = build_pool(two_link, 3000, 6, 0.5, np.random.default_rng(0))
+    count = sum(len(r["q"]) for r in rays)
+    assert 3000 <= count == sum(len(states["q"]) for states in volume)
+
+
+def test_a_domain_in_collision_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("ppcbf_robots.learning.rays.CHUNK", 200)
+    world = tmp_path / "world.yaml"
+    world.write_text("obstacles: [{name: all, type: half_space, normal: [0, 0, 1], offset: -0.1, margin: 3.0}]\n")
+    with pytest.raises(InputError, match="almost every configuration of the domain X is in collision"):
+        Trainer(load_problem("two_link", str(world)), "pp-ncbf", dataclasses.replace(DEFAULT, rays=500))
