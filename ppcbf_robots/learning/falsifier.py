@@ -14,11 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.band import Band
 from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
+from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
+ROWS = 16  # nearest rows that a barrier as it runs is judged by
 STARTS = 48  # searched from at once
 PROBES = 40  # random points for every start, of which the worst is taken
 FIRST_STEP = 0.02  # of X's width, of the finite differences
@@ -142,3 +146,31 @@ class Falsifier:
         found = [(q[bad], v[bad]), (q_far[bad_far], v_far[bad_far])]
         return (points, np.where(better, values[start, best], value), np.where(better, step, 0.5 * step),
                 [f for f in found if len(f[0])], values.size)  # fmt: skip
+
+
+def falsify(
+    problem: Problem, barrier: Barrier, config: FilterConfig, rng: np.random.Generator, seconds: float
+) -> Attack:
+    """Search against a barrier as it runs, in float64: an LB-CBF, NCBF or PP-NCBF with the QP filter.
+
+    Args:
+        problem: robot, world and controller; gamma is the barrier's.
+        barrier: with or without a network.
+        config: settings of the QP filter.
+        rng: source of randomness.
+        seconds: how long to search.
+    """
+    problem = problem.with_barrier_spec(barrier.spec)
+    network = getattr(barrier, "network", None) or NumpyNetwork("convex", no_network(problem))
+    device, dtype = torch.device("cpu"), torch.float64
+    band = Band(problem, network.kind, config, barrier.kind != "ncbf", device, dtype)
+    params = {k: torch.as_tensor(w, dtype=dtype) for k, w in network.params.items()}
+    return Falsifier(problem, band, ROWS, rng).search(params, seconds=seconds)
+
+
+def no_network(problem: Problem) -> dict[str, Array]:
+    """Parameters of a convex form that is zero everywhere: no units."""
+    nq, nv = problem.model.nq, problem.model.nv
+    shapes = {"in_shift": nq, "in_scale": nq, "turns": nq, "v_scale": nv, "ba": 0, "bb": 0, "bc": 0}
+    heads = {name: np.zeros((3 * nq, 0)) for name in ("Wa", "Wb", "Wc")}
+    return {name: np.zeros(size) for name, size in shapes.items()} | heads
