@@ -188,7 +188,8 @@ def test_info_warns_of_a_start_and_goal_in_an_obstacle(tmp_path):
 
 def test_train(training, barrier):
     assert set(training) == {"converged", "reason", "volume_kept", "violations", "samples", "start_inside", "seconds",
-                             "worst_margin", "attacked", "steps", "preset", "seed", "device", "kind", "iterations", "out"}  # fmt: skip
+                             "worst_margin", "attacked", "steps", "preset", "seed", "device", "kind", "iterations",
+                             "out"}  # fmt: skip
     assert (training["converged"], training["violations"], training["start_inside"]) == (True, 0, True)
     assert (training["samples"], training["steps"]) == (200, 50)
     assert 0.9 < training["volume_kept"] <= 1.0

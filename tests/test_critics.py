@@ -246,6 +246,9 @@ def test_the_feasibility_margin_is_exact(rows, nv, passive):
     box = ((states.v * states.u_des).sum(-1) + states.d_p) / (np.abs(states.v) @ states.u_max + 1e-9)
     np.testing.assert_allclose(margin[~possible], box[~possible])  # no passive torque in the box
     assert np.all(margin[~possible] < -1.0)
+    Lf, Lg = (torch.as_tensor(x).requires_grad_() for x in (states.Lf, states.Lg))
+    states.margin(passive, Lf, Lg).sum().backward()
+    assert torch.isfinite(Lf.grad).all() and torch.isfinite(Lg.grad).all()
 
 
 def test_the_passivity_row_counts_where_it_is_asked_for():

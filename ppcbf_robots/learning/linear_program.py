@@ -44,11 +44,11 @@ def best_worst_row(offset: torch.Tensor, c: torch.Tensor, p: torch.Tensor, budge
     batch, columns = torch.arange(B, device=c.device), T.shape[-1] - 1
     for _ in range(PIVOTS):
         reduced, entering = T[:, n + 1, :columns].min(-1)
-        improves = reduced < -_TOLERANCE
-        if not improves.any():
-            break
         column = T.gather(2, entering[:, None, None].expand(-1, n + 2, 1))[..., 0]
         steep = column[:, : n + 1] > _TOLERANCE
+        improves = (reduced < -_TOLERANCE) & steep.any(-1)  # not steep: no solution, by rounding of the budget
+        if not improves.any():
+            break
         ratio = torch.where(steep, T[:, : n + 1, columns].clamp(min=0.0) / torch.where(steep, column[:, : n + 1], 1.0),
                             torch.inf)  # fmt: skip
         tied = ratio <= ratio.amin(-1, keepdim=True) + _TIE  # of these the largest pivot: a tiny one is rounding noise
