@@ -50,3 +50,19 @@ def test_one_world_alone():
     (case,) = json.loads(done.stdout)["cases"]
     assert (case["robot"], case["pairs"], case["solver"]) == ("two_link", 1, "daqp")
     assert np.isfinite(case["median_us"])
+
+
+def test_the_learners_throughput() -> None:
+    done = CliRunner().invoke(app, ["bench", "train", "two_link", "circle", "--iterations", "10", "--json"])
+    assert done.exit_code == 0, done.output
+    cases = json.loads(done.stdout)["cases"]
+    assert {c["preset"] for c in cases} == {"paper", "default"}
+    for c in cases:
+        assert c["states_per_s"] > 100.0 * c["iterations_per_s"] > 0.0  # hundreds of states an iteration
+        assert 0.0 < c["share"] < 1.0
+
+
+def test_bench_times_the_filter_unless_told_otherwise() -> None:
+    texts = [CliRunner().invoke(app, ["bench", *words, "--help"]).output for words in ([], ["filter"], ["train"])]
+    assert "filter" in texts[0] and "train" in texts[0]
+    assert "pairs" in texts[1] and "iterations" in texts[2]
