@@ -119,7 +119,8 @@ def train_barrier(
 
 def _history(result: Result) -> list[dict[str, Any]]:
     keys = ("iteration", "volume_kept", "band_yield", "torque", "passivity", "loss", "start_inside", "seconds")
-    return [{k: getattr(m, k) for k in keys} for m in result.history]
+    rows = [{k: getattr(m, k) for k in keys} for m in result.history]
+    return [row | {"loss": row["loss"] if math.isfinite(row["loss"]) else None} for row in rows]  # JSON has no NaN
 
 
 @contextlib.contextmanager
