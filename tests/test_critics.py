@@ -294,7 +294,7 @@ def test_the_margin_is_negative_exactly_where_the_runtime_filter_has_no_answer(
     rays = Rays(**to_tensors([arrays], CPU, DOUBLE))
     s = torch.as_tensor(np.linalg.norm(v, axis=1) / np.linalg.norm(arrays["d"], axis=1))
     band = Band(problem, "convex", config, passive, CPU, DOUBLE)
-    margin = band.margin(tensors(network.params), rays, s)[0]
+    margin = band.margin(tensors(network.params), rays, s)
     runtime = SafetyFilter(model, problem.safety, barrier, config)
     failed = np.zeros(len(q), dtype=bool)
     for i in range(len(q)):
@@ -314,9 +314,9 @@ def test_near_rest_the_band_asks_for_no_passivity(two_link, random_network):
     rays = make_rays(two_link, 300)
     with_, without = (Band(two_link, "convex", FilterConfig(), passive, CPU, DOUBLE) for passive in (True, False))
     slow = torch.full((len(rays),), 0.9, dtype=DOUBLE) * (with_.slow / rays.d.abs()).amin(-1)
-    assert torch.equal(with_.margin(params, rays, slow)[0], without.margin(params, rays, slow)[0])
+    assert torch.equal(with_.margin(params, rays, slow), without.margin(params, rays, slow))
     fast = torch.full((len(rays),), 0.9, dtype=DOUBLE)
-    assert not torch.equal(with_.margin(params, rays, fast)[0], without.margin(params, rays, fast)[0])
+    assert not torch.equal(with_.margin(params, rays, fast), without.margin(params, rays, fast))
 
 
 # Passivity by construction

@@ -69,7 +69,7 @@ def margins(problem: Problem, q: Any, v: Any) -> np.ndarray:
     rays = Rays(**to_tensors([arrays], CPU, torch.float64))
     s = torch.as_tensor(np.linalg.norm(v, axis=1) / np.linalg.norm(arrays["d"], axis=1))
     params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(problem).items()}
-    return np.asarray(make(problem).band.margin(params, rays, s)[0])
+    return np.asarray(make(problem).band.margin(params, rays, s))
 
 
 @pytest.mark.parametrize("passive", [True, False])

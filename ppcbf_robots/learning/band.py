@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import torch
 
-from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.filters import NEAR_REST, FilterConfig
 from ppcbf_robots.learning.critics import feasibility_margin
 from ppcbf_robots.learning.rays import Field, Rays
@@ -52,15 +51,15 @@ class Band:
         v = s[:, None] * rays.d
         return Nominal(v, rays.u_rest - self.kd * v, (self.kd * v * v).sum(-1))
 
-    def margin(
-        self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None
-    ) -> tuple[torch.Tensor, BarrierRows]:
-        """The QP's exact feasibility margin (B,), without the passivity row near rest, and the rows it is of."""
+    def margin(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> torch.Tensor:
+        """The QP's exact feasibility margin (B,), without the passivity row near rest."""
         rows, nominal = self.field.rows(params, rays, s), self.nominal(rays, s)
         wanted = self.passive if passive is None else passive
         moving = (nominal.v.abs() > self.slow).any(-1) & wanted
-        margin = feasibility_margin(rows, nominal.v, nominal.u_des, nominal.d_p, self.u_max, self.config, moving)
-        return margin, rows
+        margin: torch.Tensor = feasibility_margin(
+            rows, nominal.v, nominal.u_des, nominal.d_p, self.u_max, self.config, moving
+        )
+        return margin
 
     @torch.no_grad()
     def least_margin(self, params: Params, rays: Rays) -> tuple[torch.Tensor, torch.Tensor]:
@@ -71,7 +70,7 @@ class Band:
             found = crosses.nonzero()[:, 0]
             if not len(found):
                 continue
-            margin = self.margin(params, rays.select(found), s[found])[0]
+            margin = self.margin(params, rays.select(found), s[found])
             lower = margin < least[found]
             better = found[lower]
             least[better], at[better] = margin[lower], s[better]

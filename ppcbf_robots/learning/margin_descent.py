@@ -68,13 +68,13 @@ class MarginDescent(Descent):
         rays = self.rays.select(index)
         self.evaluated += len(index)
         with torch.no_grad():
-            margin = self.band.margin(self.params, rays, s)[0]
+            margin = self.band.margin(self.params, rays, s)
             self._noted[index] = margin
         shrinkage, unrest = self._shrinkage(rays.select(slice(drawn)), s[:drawn])
         loss = self._weight * shrinkage + self._simplicity * unrest
         short = (margin < self.margin).nonzero()[:, 0]  # the others have no gradient
         if len(short):
-            wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short])[0])
+            wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short]))
             loss = loss + wanting.sum() / len(index) + p.worst_weight * wanting.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -109,8 +109,8 @@ class MarginDescent(Descent):
             if not len(index):
                 return 0.0, 0.0, 0.0
             rays = self.rays.select(index)
-            fails = self.band.margin(self.params, rays, s)[0] < 0.0
-            alone = self.band.margin(self.params, rays, s, passive=False)[0] < 0.0
+            fails = self.band.margin(self.params, rays, s) < 0.0
+            alone = self.band.margin(self.params, rays, s, passive=False) < 0.0
             torque = max(float(alone.float().mean()), found, float(len(attack.q) > 0) / CHECK_STATES)
             return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
 
