@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import click
+from typing import Any
+
 import typer
 from typer.core import TyperGroup
 
@@ -13,7 +14,7 @@ from ppcbf_robots.cli.bench_train import train as bench_train
 class FilterByDefault(TyperGroup):
     """``ppcbf bench panda`` is ``ppcbf bench filter panda``."""
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put ``filter`` first where no subcommand is named."""
         if not args or (args[0] not in self.commands and args[0] != "--help"):
             args = ["filter", *args]

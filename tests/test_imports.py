@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
+from importlib.metadata import packages_distributions
 from importlib.resources import files
 from pathlib import Path
 
@@ -138,6 +141,22 @@ def test_libraries_stay_with_their_owners(library):
                 assert owner in OWNERS[library], f"{module} imports {library}"
                 assert lazy or owner not in LAZY.get(library, []), f"{module} imports {library} at its top"
     assert users, f"nothing imports {library} any more: take it out of the table"
+
+
+def test_every_library_imported_is_a_declared_one():
+    """What another library happens to bring (typer once brought click) may be gone with its next version."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    required = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+
+    def normal(name: str) -> str:
+        return re.sub(r"[-_.]+", "-", name).lower()
+
+    declared = {normal(re.split(r"[\[<>=!~; ]", requirement)[0]) for requirement in required}
+    providers = {**packages_distributions(), "pinocchio": ["pin"]}  # cmeel's packages are not listed there
+    for module in MODULES:
+        for library in {name.split(".")[0] for name, _ in imports(module)} - sys.stdlib_module_names - {PACKAGE}:
+            brought = {normal(name) for name in providers.get(library, [library])}
+            assert brought & declared, f"{module} imports {library}, which pyproject.toml does not ask for"
 
 
 @pytest.mark.parametrize("module", ["safety_filter", "rollout", "artefact", "problem", "cli.main"])
