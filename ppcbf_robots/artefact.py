@@ -21,7 +21,7 @@ from ppcbf_robots.network import NetworkKind, NumpyNetwork, Params
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import BarrierSpec, Positive, Spec, validate
 
-FORMAT = 2
+FORMAT = 3
 KEYS = {"kind": str, "network": str, "formula": dict, "filter": dict, "fingerprint": dict, "weights_sha256": str,
         "robot": str, "world": str, "joints": list, "training": dict}  # fmt: skip
 PACKAGES = ("ppcbf-robots", "pin", "numpy", "torch", "proxsuite")
@@ -175,6 +175,8 @@ def _shapes_fit(kind: NetworkKind, params: Params, nv: int) -> bool:
     else:
         shapes |= {"turns": (nq,), "Wa": (width, units), "Wb": (width, units * nv), "Wc": (width, units)}
         shapes |= {"ba": (units,), "bb": (units * nv,), "bc": (units,), "v_scale": (nv,)}
+        for form in ("cone", "bowl"):
+            shapes |= {f"{form}_a": (), f"{form}_b": (nv,), f"{form}_c": ()}
     return nv <= nq <= 2 * nv and {name: w.shape for name, w in params.items()} == shapes
 
 

@@ -32,6 +32,7 @@ class BarrierRows:
     """Values of all rows of a barrier at one state; leading batch axes are allowed."""
 
     h: Any  # (..., rows)
+    hdot: Any  # (..., rows)
     phi: Any  # (..., rows)
     Lf_phi: Any  # (..., rows)
     Lg_phi: Any  # (..., rows, nv)
@@ -52,7 +53,7 @@ def rho_rows(
     w = grad - K_v[..., None, :]
     Lg_phi = w @ Minv
     Lf_phi = curvature + gamma * hdot - K_q_rate[..., None] - (Lg_phi @ b[..., None])[..., 0]
-    return BarrierRows(h, hdot + gamma * h - K[..., None], Lf_phi, Lg_phi, w)
+    return BarrierRows(h, hdot, hdot + gamma * h - K[..., None], Lf_phi, Lg_phi, w)
 
 
 class Barrier(Protocol):
@@ -108,4 +109,5 @@ class EnergyBarrier:
         Lg_phi: Array = np.broadcast_to(-dyn.v[..., None, :], safety.grad.shape)
         Mv = (dyn.M @ dyn.v[..., None])[..., 0]
         w = np.broadcast_to(-Mv[..., None, :], safety.grad.shape)
-        return BarrierRows(safety.h, alpha * safety.h - dyn.kinetic_energy[..., None], Lf_phi, Lg_phi, w)
+        phi = alpha * safety.h - dyn.kinetic_energy[..., None]
+        return BarrierRows(safety.h, safety.hdot(dyn.v), phi, Lf_phi, Lg_phi, w)

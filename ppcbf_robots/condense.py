@@ -12,22 +12,24 @@ from ppcbf_robots.kernels import kernel
 
 @kernel
 def condense(
-    phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
-    alpha: float, speed_alpha: float, margin: float, flat: float, tolerance: float,
+    hdot: Any, phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
+    alpha: float, release: float, speed_alpha: float, margin: float, flat: float, tolerance: float,
     C: Any, lower: Any, norm: Any, binding: Any,
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill the rows ``C z >= lower`` of ``z = (u - u_des) / u_max``.
 
-    Rows 0 to R are ``psi_k(u) >= -alpha (phi_k - margin)``, then follow for every joint of ``v_domain``
+    Rows 0 to R are ``psi_k(u) >= -alpha (phi_k - margin) - release max(0, min(ḣ_k, phi_k))``: the gain of a pair that
+    separates rises up to ``alpha + release``. Then follow for every joint of ``v_domain``
     ``v̇ >= -speed_alpha (v - lowest)`` and ``-v̇ >= -speed_alpha (highest - v)``, which keep it in the velocity domain.
 
     Args:
-        phi, Lf: (R,).
+        hdot, phi, Lf: (R,).
         Lg: (R, nv).
         Minv, b, v: of the state.
         v_domain: (nv, 2), or (0, 2) for no such rows.
         u_des, u_max: (nv,).
         alpha: class-K gain [1/s].
+        release: what joins it for pairs that separate [1/s].
         speed_alpha: that of the velocity domain [1/s].
         margin: kept off phi.
         flat: length of a row, in units of phi̇ per full torque, below which no torque steers it.
@@ -46,7 +48,7 @@ def condense(
         joint = (k - R) // 2
         sign = 1.0 if (k - R) % 2 == 0 else -1.0
         if k < R:
-            slack = Lf[k] + alpha * (phi[k] - margin)
+            slack = Lf[k] + alpha * (phi[k] - margin) + release * max(0.0, min(hdot[k], phi[k]))
         else:
             slack = speed_alpha * sign * (v[joint] - v_domain[joint, 0 if sign > 0 else 1])
         length = 0.0
@@ -130,14 +132,14 @@ def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
 def rho_rows_at(
     h: Any, grad: Any, drift: Any, curvature: Any, v: Any, Minv: Any, b: Any, gamma: float, K: float, K_q_rate: float,
     K_v: Any,
-) -> tuple[Any, Any, Any, Any]:  # fmt: skip
-    """phi (R,), L_f phi (R,), L_g phi and w (R, nv) of :func:`ppcbf_robots.barriers.rho_rows` at one state."""
+) -> tuple[Any, Any, Any, Any, Any]:  # fmt: skip
+    """ḣ, phi, L_f phi (R,), L_g phi and w (R, nv) of :func:`ppcbf_robots.barriers.rho_rows` at one state."""
     R, nv = grad.shape
-    phi, Lf, Lg, w = np.empty(R), np.empty(R), np.empty((R, nv)), np.empty((R, nv))
+    hdot, phi, Lf, Lg, w = np.empty(R), np.empty(R), np.empty(R), np.empty((R, nv)), np.empty((R, nv))
     for k in range(R):
-        hdot, bias = drift[k], 0.0
+        hdot[k], bias = drift[k], 0.0
         for j in range(nv):
-            hdot += grad[k, j] * v[j]
+            hdot[k] += grad[k, j] * v[j]
             w[k, j] = grad[k, j] - K_v[j]
             Lg[k, j] = 0.0
         for i in range(nv):
@@ -145,6 +147,6 @@ def rho_rows_at(
                 Lg[k, j] += w[k, i] * Minv[i, j]
         for j in range(nv):
             bias += Lg[k, j] * b[j]
-        phi[k] = hdot + gamma * h[k] - K
-        Lf[k] = curvature[k] + gamma * hdot - K_q_rate - bias
-    return phi, Lf, Lg, w
+        phi[k] = hdot[k] + gamma * h[k] - K
+        Lf[k] = curvature[k] + gamma * hdot[k] - K_q_rate - bias
+    return hdot, phi, Lf, Lg, w

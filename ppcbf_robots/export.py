@@ -48,7 +48,9 @@ _K_FORMULA: dict[NetworkKind, tuple[str, ...]] = {
         _HIDDEN,
         "a = softplus(x Wa + ba), c = x Wc + bc, b = (x Wb + bb) as a (units, nv) matrix",
         "z = b (v * v_scale)",
-        "K = sum_j a_j (softplus(z_j + c_j) - softplus(c_j) - sigmoid(c_j) z_j)",
+        "F = softplus(cone_a) (sqrt(|cone_b v * v_scale|^2 + softplus(cone_c)^2) - softplus(cone_c))",
+        "G = softplus(bowl_a) (softplus(|bowl_b v * v_scale|^2 - bowl_c) - softplus(-bowl_c))",
+        "K = F + G + sum_j a_j (softplus(z_j + c_j) - softplus(c_j) - sigmoid(c_j) z_j)",
     ),
 }
 _PHI_FORMULA = (

@@ -96,7 +96,10 @@ static inline double ${p}_K(const double *q, const double *v, double *dK_dq, dou
 {
     double ra[${P}_UNITS], c[${P}_UNITS], b[${P}_UNITS * ${P}_NV];
     double dra[${P}_UNITS], dc[${P}_UNITS], db[${P}_UNITS * ${P}_NV]; /* dK/dra, dK/dc, dK/db */
-    double s[${P}_NV], g[${P}_LAST], dx[3 * ${P}_NQ], K = 0.0;
+    double s[${P}_NV], g[${P}_LAST], dx[3 * ${P}_NQ], K;
+    const double rounded = ${p}_softplus(${p}_cone_c[0]);
+    const double cone = ${p}_softplus(${p}_cone_a[0]), bowl = ${p}_softplus(${p}_bowl_a[0]);
+    double root = rounded * rounded, depth = -${p}_bowl_c[0];
     ${p}_layers L;
     double *const cosine = L.x0 + ${P}_NQ, *const sine = L.x0 + 2 * ${P}_NQ;
     for (int i = 0; i < ${P}_NQ; ++i) {
@@ -110,8 +113,14 @@ static inline double ${p}_K(const double *q, const double *v, double *dK_dq, dou
     ${p}_affine(${P}_LAST, ${P}_UNITS * ${P}_NV, L.${last}, ${p}_Wb, ${p}_bb, b);
     for (int i = 0; i < ${P}_NV; ++i) {
         s[i] = v[i] * ${p}_v_scale[i];
-        dK_dv[i] = 0.0;
+        root += ${p}_cone_b[i] * ${p}_cone_b[i] * s[i] * s[i];
+        depth += ${p}_bowl_b[i] * ${p}_bowl_b[i] * s[i] * s[i];
     }
+    root = sqrt(root);
+    K = cone * (root - rounded) + bowl * (${p}_softplus(depth) - ${p}_softplus(-${p}_bowl_c[0]));
+    for (int i = 0; i < ${P}_NV; ++i)
+        dK_dv[i] = (cone / root * ${p}_cone_b[i] * ${p}_cone_b[i]
+                    + 2.0 * bowl * ${p}_sigmoid(depth) * ${p}_bowl_b[i] * ${p}_bowl_b[i]) * s[i] * ${p}_v_scale[i];
     for (int j = 0; j < ${P}_UNITS; ++j) {
         const double z = ${p}_dot(${P}_NV, b + j * ${P}_NV, s), a = ${p}_softplus(ra[j]);
         const double sig = ${p}_sigmoid(z + c[j]), sig0 = ${p}_sigmoid(c[j]);

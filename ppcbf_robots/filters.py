@@ -33,8 +33,9 @@ _TINY = 1e-12
 _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
-SPEED_SHARE = 0.3  # of the way to the bound of the velocity domain that one control period may go
-NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
+FAST_SHARE = 0.5  # of the way to a bound that one control period may go, where acting late costs nothing
+NEAR_REST = 5e-3  # of v_max: slower than this on every joint, an arm counts as at rest
+FREE_POWER = 2e-3  # of u_max · v_max, by which a correction may exceed d_p: near rest (9) cannot hold exactly
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
 
@@ -65,9 +66,13 @@ class FilterConfig:
     dt: float = 1e-3  # [s], control period
 
     @property
-    def speed_alpha(self) -> float:
-        """Class-K gain [1/s] of the rows that keep the velocity domain: late, yet within a few control periods."""
-        return SPEED_SHARE / self.dt
+    def fast_alpha(self) -> float:
+        """Class-K gain [1/s] of rows that act late, yet within a few control periods.
+
+        Those of the velocity domain have it, and pairs that separate on top of ``alpha``: a damped spring between arm
+        and obstacle, as ``psi >= -alpha phi`` is, would hold back a motion that leads away, and pay for it with energy.
+        """
+        return FAST_SHARE / self.dt
 
     def __post_init__(self) -> None:
         """Refuse what would disable a constraint without a word."""
@@ -174,11 +179,21 @@ def is_slow(robot: RobotModel, v: Array) -> bool:
     return bool((np.abs(v) <= NEAR_REST * robot.v_max).all())
 
 
+def free_power(robot: RobotModel) -> float:
+    """Power [W] by which a correction may exceed d_p.
+
+    As v -> 0 the left side of the paper's (9) is O(|v|) and the right side O(|v|²): there a milliwatt would be bought
+    with full torque on joints that hardly move.
+    """
+    return FREE_POWER * float(robot.u_max @ robot.v_max)
+
+
 class QPFilter:
     """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
 
-    Rows are ``psi_k(u) >= -alpha (phi_k - margin)`` (PP-CBF: alpha = gamma_K, no margin), the velocity domain's, and
-    ``vᵀ δ <= d_p``. The near rows are those closest to violation by u_des, each in units of the correction it needs;
+    Rows are ``psi_k(u) >= -alpha (phi_k - margin) - fast_alpha max(0, min(ḣ_k, phi_k))`` (of the PP-CBF
+    ``psi_k(u) >= -gamma_K phi_k``), the velocity domain's, and ``vᵀ δ <= d_p + FREE_POWER u_max · v_max``. The near
+    rows are those closest to violation by u_des, each in units of the correction it needs;
     the others are checked afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
     solution, the velocity domain is given up first, then passivity; then the least violation is sought.
     """
@@ -194,9 +209,9 @@ class QPFilter:
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
         binding = np.empty(count, dtype=np.bool_)
         hopeless, hold = condense(
-            rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            alpha, self.config.speed_alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE,
-            C, lower, norm, binding,
+            rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            alpha, 0.0 if energy else self.config.fast_alpha, self.config.fast_alpha,
+            0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
         )  # fmt: skip
         return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold
 
@@ -231,16 +246,12 @@ class QPFilter:
         return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
-        """vᵀ δ <= d_p as (row, lower) of length 1; None near rest.
-
-        There the direction of v is noise, and a milliwatt would be bought with full torque on joints that hardly move;
-        the kinetic metric's correction takes energy out without the row.
-        """
-        if d_p is None or is_slow(self.safety.robot, dyn.v):
-            return None
+        """vᵀ δ <= d_p + free_power as (row, lower) of length 1; None where every torque satisfies it."""
         row = -dyn.v * u_max
         norm = float(np.sqrt(row @ row))
-        return row / norm, -d_p / norm
+        if d_p is None or norm < _TINY:
+            return None
+        return row / norm, -(d_p + free_power(self.safety.robot)) / norm
 
     def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
         return np.asarray(hessian(dyn.Minv, u_max, self.config.metric == "kinetic"))

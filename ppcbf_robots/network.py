@@ -7,9 +7,12 @@ Two forms:
 
 * ``mlp``: the paper's perceptron with ELU units and squared output, made zero at rest,
   ``K = (f(q, v) - f(q, 0))²`` (``zero_at_rest = 0`` gives the paper's letter, ``f²``).
-* ``convex``: ``K = Σ_j a_j(q) D_j``, where D_j is the Bregman divergence of ``z -> softplus(z + c_j(q))`` between 0 and
-  ``z_j = b_j(q) · v / v_scale``, with ``a_j >= 0``. It is smooth, zero with zero gradient at rest and convex in v, so
-  ``v · ∂K/∂v >= K >= 0``: the corrections of the kinetic metric dissipate (see the README's theory section).
+* ``convex``: ``K = F(v) + G(v) + Σ_j a_j(q) D_j``. D_j is the Bregman divergence of ``z -> softplus(z + c_j(q))``
+  between 0 and ``z_j = b_j(q) · v / v_scale``, with ``a_j >= 0``. F is a rounded cone ``a (sqrt(|s|² + c²) - c)`` and G
+  a bowl ``a (softplus(|s|² - c) - softplus(-c))`` of the scaled velocity ``s = b v / v_scale``, with ``a >= 0`` and
+  weights b for each joint: they slow all motions and, without q, cannot be steep in it. All are smooth, zero with zero
+  gradient at rest and convex in v, so ``v · ∂K/∂v >= K >= 0``: the corrections of the kinetic metric dissipate (see the
+  README's theory section).
   Its layers see q scaled to X and, as the dynamics do, the cosine and sine of every angle (``turns`` is 1 for angles
   and 0 for lengths and for the cos and sin of continuous joints).
 """
@@ -95,15 +98,27 @@ def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
     z = (b * s[..., None, :]).sum(-1)
     sig, sig0 = _sigmoid(xp, z + c), _sigmoid(xp, c)
     D = _softplus(xp, z + c) - _softplus(xp, c) - sig0 * z
-    K = (a * D).sum(-1)
+    F, dF_dv = _speed_terms(xp, p, s)
+    K = (a * D).sum(-1) + F
     dz = a * (sig - sig0)  # dK/dz
     dc = dz - a * sig0 * (1.0 - sig0) * z
-    dK_dv = (dz[..., None] * b).sum(-2) * p["v_scale"]
-    db = (dz[..., None] * s[..., None, :]).reshape(*x.shape[:-1], -1)
+    dK_dv = ((dz[..., None] * b).sum(-2) + dF_dv) * p["v_scale"]
+    db = (dz[..., None] * s[..., None, :]).reshape(*x.shape[:-1], units * v.shape[-1])
     g = (D * _sigmoid(xp, ra)) @ p["Wa"].T + dc @ p["Wc"].T + db @ p["Wb"].T
     g, nq = _pull_back(p, g, slopes), q.shape[-1]
     dK_dq = g[..., :nq] * p["in_scale"] + p["turns"] * (cos * g[..., 2 * nq :] - sin * g[..., nq : 2 * nq])
     return K, dK_dq, dK_dv
+
+
+def _speed_terms(xp: Any, p: Params, s: Any) -> tuple[Any, Any]:
+    """F + G (...) of the scaled velocity s (..., nv) and their gradient (..., nv)."""
+    cone_square, bowl_square = p["cone_b"] * p["cone_b"], p["bowl_b"] * p["bowl_b"]
+    cone_a, cone_c = _softplus(xp, p["cone_a"]), _softplus(xp, p["cone_c"])
+    root = xp.sqrt((cone_square * s * s).sum(-1) + cone_c * cone_c)
+    bowl_a, z = _softplus(xp, p["bowl_a"]), (bowl_square * s * s).sum(-1) - p["bowl_c"]
+    value = cone_a * (root - cone_c) + bowl_a * (_softplus(xp, z) - _softplus(xp, -p["bowl_c"]))
+    slopes = (cone_a / root)[..., None] * cone_square + (2.0 * bowl_a * _sigmoid(xp, z))[..., None] * bowl_square
+    return value, slopes * s
 
 
 def _mlp_out(xp: Any, p: Params, q: Any, v: Any) -> Any:
@@ -127,7 +142,12 @@ def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> C
     a, c, b = _convex_units(xp, p, q)
     slope = (b * (d * p["v_scale"])[..., None, :]).sum(-1)
     rest, tangent = _softplus(xp, c), _sigmoid(xp, c) * slope
-    return lambda s: (a * (_softplus(xp, s[..., None] * slope + c) - rest - s[..., None] * tangent)).sum(-1)
+
+    def K(s: Any) -> Any:
+        units = (a * (_softplus(xp, s[..., None] * slope + c) - rest - s[..., None] * tangent)).sum(-1)
+        return units + _speed_terms(xp, p, s[..., None] * d * p["v_scale"])[0]
+
+    return K
 
 
 _FORMS = {"mlp": _mlp, "convex": _convex}
@@ -171,7 +191,13 @@ class NumpyNetwork:
         if self.kind == "mlp":
             return *common, p["w_out"], float(p["b_out"]), float(p["zero_at_rest"])
         heads = (np.ascontiguousarray(p[f"W{k}"].T) if w else p[f"b{k}"] for k in "abc" for w in (True, False))
-        return *common, p["turns"], p["v_scale"], *heads
+        return (
+            *common,
+            p["turns"],
+            p["v_scale"],
+            *heads,
+            *(p[f"{form}_{k}"] for form in ("cone", "bowl") for k in "abc"),
+        )
 
 
 def random_convex(nq: int, nv: int, hidden: tuple[int, ...], units: int, rng: np.random.Generator) -> dict[str, Any]:
@@ -179,6 +205,8 @@ def random_convex(nq: int, nv: int, hidden: tuple[int, ...], units: int, rng: np
     widths = (3 * nq, *hidden)
     params: dict[str, Any] = {"in_shift": np.zeros(nq), "in_scale": np.ones(nq), "v_scale": np.ones(nv)}
     params["turns"] = np.ones(nq)
+    params |= {"cone_a": np.array(-2.0), "cone_b": np.ones(nv), "cone_c": np.array(-3.0)}
+    params |= {"bowl_a": np.array(-3.0), "bowl_b": np.ones(nv), "bowl_c": np.array(1.0)}
     for i, (a, b) in enumerate(itertools.pairwise(widths)):
         params |= {f"W{i}": rng.normal(0.0, a**-0.5, (a, b)), f"b{i}": np.zeros(b)}
     for name, outputs, bias in (("a", units, -4.0), ("b", units * nv, 0.0), ("c", units, -1.0)):

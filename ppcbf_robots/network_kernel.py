@@ -88,6 +88,7 @@ def _sigmoid(x: float) -> float:
 def convex(
     q: Any, v: Any, weights: Any, widths: Any, shift: Any, scale: Any, turns: Any, v_scale: Any,
     Wa: Any, ba: Any, Wb: Any, bb: Any, Wc: Any, bc: Any,
+    cone_a: Any, cone_b: Any, cone_c: Any, bowl_a: Any, bowl_b: Any, bowl_c: Any,
 ) -> Any:  # fmt: skip
     """K, ∂K/∂q and ∂K/∂v of the convex form; Wa, Wc (units, width), Wb (units nv, width) are transposed."""
     nq, nv, units, width = len(q), len(v), len(ba), widths[-1]
@@ -98,8 +99,17 @@ def convex(
         features[i] = (q[i] - shift[i]) * scale[i]
         features[nq + i], features[2 * nq + i] = math.cos(angle), math.sin(angle)
     x = _hidden(features, weights, widths, slopes)
-    s, K = v * v_scale, 0.0
-    K_v, g = np.zeros(nv), np.zeros(width)
+    s, round_ = v * v_scale, _softplus(cone_c.item())
+    K_v, g = np.empty(nv), np.zeros(width)
+    root, bowl = round_**2, -bowl_c.item()
+    for j in range(nv):
+        root += (cone_b[j] * s[j]) ** 2
+        bowl += (bowl_b[j] * s[j]) ** 2
+    root, along_cone, along_bowl = math.sqrt(root), _softplus(cone_a.item()), _softplus(bowl_a.item())
+    K = along_cone * (root - round_) + along_bowl * (_softplus(bowl) - _softplus(-bowl_c.item()))
+    for j in range(nv):
+        slope = along_cone / root * cone_b[j] ** 2 + 2.0 * along_bowl * _sigmoid(bowl) * bowl_b[j] ** 2
+        K_v[j] = slope * s[j] * v_scale[j]
     for u in range(units):
         ra, c = ba[u], bc[u]
         for k in range(width):

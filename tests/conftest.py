@@ -107,7 +107,9 @@ def random_network() -> Callable[..., NumpyNetwork]:
         params["W0"] *= (inputs / features) ** 0.5  # as steep with the cosines and sines as without
         params |= {"in_shift": rng.normal(0.0, 0.1, inputs), "in_scale": rng.uniform(0.5, 1.5, inputs)}
         params |= {"b_out": np.array(0.3), "zero_at_rest": np.array(1.0)} if kind == "mlp" else {
-            "v_scale": rng.uniform(0.5, 1.5, nv), "turns": np.arange(nq) % 3 < 2}  # fmt: skip
+            "v_scale": rng.uniform(0.5, 1.5, nv), "turns": np.arange(nq) % 3 < 2,
+            "cone_a": rng.normal(), "cone_b": rng.normal(size=nv), "cone_c": rng.normal(),
+            "bowl_a": rng.normal(), "bowl_b": rng.normal(size=nv), "bowl_c": rng.normal()}  # fmt: skip
         return NumpyNetwork(kind, params)
 
     return build

@@ -53,6 +53,8 @@ def random_network(kind: str, nq: int, nv: int, rng: np.random.Generator, widths
         for name, m in (("a", units), ("c", units), ("b", units * nv)):
             params[f"W{name}"], params[f"b{name}"] = rng.normal(size=(n, m)) / np.sqrt(n), rng.normal(size=m)
         params |= {"v_scale": rng.uniform(0.3, 1.5, nv), "turns": rng.integers(0, 2, nq)}
+        for form in ("cone", "bowl"):
+            params |= {f"{form}_a": rng.normal(), f"{form}_b": rng.normal(size=nv), f"{form}_c": rng.normal()}
     return NumpyNetwork(kind, params)
 
 

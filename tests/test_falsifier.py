@@ -37,7 +37,7 @@ def nothing_learned(problem: Problem) -> dict[str, Any]:
     """Parameters with K = 0: the LB barrier."""
     model = problem.model
     params = random_convex(model.nq, model.nv, (8,), 2, np.random.default_rng(0))
-    return params | {"ba": np.full(2, -1e3)}
+    return params | {"ba": np.full(2, -1e3), "cone_a": np.array(-1e3), "bowl_a": np.array(-1e3)}
 
 
 def make(problem: Problem, seed: int = 0, passive: bool = True, dtype: torch.dtype = torch.float64) -> Falsifier:
@@ -62,6 +62,11 @@ def statuses(problem: Problem, q: Any, v: Any, passive: bool = True) -> list[Sta
     return found
 
 
+def evaluated(problem: Problem, q: Any, v: Any) -> Any:
+    dyn = problem.model.evaluate_batch(q, v)
+    return dyn, problem.safety.evaluate(dyn)
+
+
 def margins(problem: Problem, q: Any, v: Any) -> np.ndarray:
     """Margins of states themselves, with all rows."""
     arrays, _, free = rays_at(problem, q, v, 1000)
@@ -80,8 +85,7 @@ def test_a_planted_violation_is_found_and_is_one_for_the_runtime_filter(weak, pa
     assert found.evaluated > 2 * STARTS
     some = np.random.default_rng(0).choice(len(found.q), 100)
     assert min(statuses(weak, found.q[some], found.v[some], passive)) >= Status.PASSIVITY_DROPPED
-    dyn = weak.model.evaluate_batch(found.q, found.v)
-    safety = weak.safety.evaluate(dyn)
+    dyn, safety = evaluated(weak, found.q, found.v)
     phi = weak.barrier("lb-cbf").rows(dyn, safety).phi.min(-1)
     assert safety.h.min() >= 0.0
     assert phi.min() > -0.01 and phi.max() < weak.robot.spec.barrier.epsilon + 0.01
@@ -142,13 +146,15 @@ def test_it_starts_where_it_is_told_to(weak):
     params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(weak).items()}
     falsifier, domain = make(weak), weak.robot.domain
     bad = attack(weak, rounds=0)
-    starts = np.hstack([weak.model.to_angles(bad.q), bad.v])[:10]
+    phi = weak.barrier("lb-cbf").rows(*evaluated(weak, bad.q, bad.v)).phi.min(-1)
+    level = np.clip(phi / weak.robot.spec.barrier.epsilon, 0.0, 1.0)
+    starts = np.hstack([weak.model.to_angles(bad.q), bad.v, level[:, None]])[:10]
     given = starts.copy()
     found = falsifier.search(params, rounds=0, starts=starts)
     assert (found.evaluated, len(found.q)) == (10, 10)
     np.testing.assert_array_equal(starts, given)
-    away = np.hstack([domain.q[:, :1].T, np.array([[-4.0, 0.0]])])
+    away = np.hstack([domain.q[:, :1].T, np.array([[-4.0, 0.0, 0.5]])])
     least, _, v = falsifier.margins(params, away)
     assert np.isinf(least[0]) and not v.any()
-    nothing = falsifier.search(params, rounds=3, starts=np.zeros((0, 4)))
+    nothing = falsifier.search(params, rounds=3, starts=np.zeros((0, 5)))
     assert (nothing.worst, len(nothing.q), nothing.evaluated) == (np.inf, 0, 0)

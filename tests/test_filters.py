@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ppcbf_robots.barriers import EnergyBarrier, RhoBarrier
-from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status
+from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, free_power
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.qp import QPProblem, make_solver
 from ppcbf_robots.robot import RobotModel
@@ -35,7 +35,8 @@ def qp_slack(barrier, rows, u, config):
     """What the QP's rows ask to be >= 0."""
     if barrier.kind == "pp-cbf":
         return rows.psi(u) + barrier.spec.gamma_K * rows.phi
-    return rows.psi(u) + config.alpha * (rows.phi - config.margin)
+    separating = np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+    return rows.psi(u) + config.alpha * (rows.phi - config.margin) + config.fast_alpha * separating
 
 
 def weight(dyn, metric):
@@ -114,7 +115,7 @@ def speed_rows(dyn, v_domain, u_des, alpha):
 def reference_qp(dyn, rows, u_des, d_p, u_max, barrier, config, v_domain=()):
     """The whole QP, every row at once, by DAQP: the torque, or None if infeasible."""
     H = weight(dyn, config.metric) * np.outer(u_max, u_max)
-    speed, slack = speed_rows(dyn, v_domain, u_des, 0.3 / config.dt)
+    speed, slack = speed_rows(dyn, v_domain, u_des, config.fast_alpha)
     C = np.vstack([rows.Lg_phi, speed]) * u_max
     lower = -np.concatenate([qp_slack(barrier, rows, u_des, config), slack])
     if d_p is not None:
@@ -139,10 +140,11 @@ def test_qp_is_the_least_correction_over_all_rows(problem, states, make_barrier,
             continue
         nominal = problem.robot.controller.evaluate(dyn)
         answer = qp_filter.correct(dyn, safety, rows, nominal.u, float(nominal.d_p), model.u_max)
-        expected = reference_qp(dyn, rows, nominal.u, float(nominal.d_p), model.u_max, barrier, config, v_domain)
+        budget = float(nominal.d_p) + free_power(model)
+        expected = reference_qp(dyn, rows, nominal.u, budget, model.u_max, barrier, config, v_domain)
         status = Status.CORRECTING
         if expected is None:
-            expected = reference_qp(dyn, rows, nominal.u, float(nominal.d_p), model.u_max, barrier, config)
+            expected = reference_qp(dyn, rows, nominal.u, budget, model.u_max, barrier, config)
         if expected is None:
             expected = reference_qp(dyn, rows, nominal.u, None, model.u_max, barrier, config)
             status = Status.PASSIVITY_DROPPED
@@ -266,7 +268,7 @@ def test_promises_hold_on_every_answer(problem, states, barrier_name, make_barri
             assert np.all(after >= -1e-5 * np.maximum(scale, np.abs(before)) - 1e-9 * ~usable)
         if answer.status is Status.CORRECTING and d_p is not None:
             power = dyn.v @ (answer.u - u_des)
-            assert power <= d_p + 1e-5 * max(np.linalg.norm(dyn.v * model.u_max), abs(d_p))
+            assert power <= d_p + free_power(model) + 1e-5 * max(np.linalg.norm(dyn.v * model.u_max), abs(d_p))
         if answer.status is Status.FREE:
             np.testing.assert_array_equal(answer.u, u_des)
 

@@ -370,11 +370,11 @@ def weights_over(descent: MarginDescent, margin: float, count: int, monkeypatch:
 
 def test_the_volumes_weight_falls_with_violations_and_grows_without(two_link, monkeypatch):
     descent, largest = margin_descent(two_link), TINY.volume_weight
-    falling = weights_over(descent, -0.1, 60, monkeypatch)
+    falling = weights_over(descent, -0.1, 80, monkeypatch)
     assert falling[0] == pytest.approx(WEIGHT_FALL * largest)
     assert np.all(np.diff(falling) <= 0.0)
     assert falling[-1] == pytest.approx(LEAST_WEIGHT * largest)
-    growing = weights_over(descent, 0.5, 200, monkeypatch)
+    growing = weights_over(descent, 0.5, 350, monkeypatch)
     assert growing[0] == pytest.approx(WEIGHT_GROWTH * falling[-1])
     assert np.all(np.diff(growing) >= 0.0)
     assert growing[-1] == pytest.approx(largest)

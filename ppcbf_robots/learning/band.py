@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ppcbf_robots.filters import NEAR_REST, FilterConfig
+from ppcbf_robots.filters import FilterConfig, free_power
 from ppcbf_robots.learning.critics import feasibility_margin
 from ppcbf_robots.learning.rays import Field, Rays
 from ppcbf_robots.network import NetworkKind, Params
@@ -44,7 +44,7 @@ class Band:
         self.config, self.passive, self.epsilon = config, passive, spec.epsilon
         self.u_max = torch.as_tensor(model.u_max, device=device, dtype=dtype)
         self.kd = torch.as_tensor(problem.robot.controller.gains.kd, device=device, dtype=dtype)
-        self.slow = torch.as_tensor(NEAR_REST * model.v_max, device=device, dtype=dtype)
+        self.free_power = free_power(model)
 
     def nominal(self, rays: Rays, s: torch.Tensor) -> Nominal:
         """The nominal torque at v = s d and its dissipation."""
@@ -52,12 +52,11 @@ class Band:
         return Nominal(v, rays.u_rest - self.kd * v, (self.kd * v * v).sum(-1))
 
     def margin(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> torch.Tensor:
-        """The QP's exact feasibility margin (B,), without the passivity row near rest."""
+        """The QP's exact feasibility margin (B,), with the passivity row or without."""
         rows, nominal = self.field.rows(params, rays, s), self.nominal(rays, s)
-        wanted = self.passive if passive is None else passive
-        moving = (nominal.v.abs() > self.slow).any(-1) & wanted
+        wanted, budget = self.passive if passive is None else passive, nominal.d_p + self.free_power
         margin: torch.Tensor = feasibility_margin(
-            rows, nominal.v, nominal.u_des, nominal.d_p, self.u_max, self.config, moving
+            rows, nominal.v, nominal.u_des, budget, self.u_max, self.config, wanted
         )
         return margin
 

@@ -14,7 +14,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.learning.train import Monitor, Trainer
 
 FILE = "checkpoint.safetensors"
-FORMAT = 2  # of the file; one of another format belongs to another version
+FORMAT = 3  # of the file; one of another format belongs to another version
 AGAIN = "train from the start without --resume"
 
 

@@ -24,6 +24,7 @@ def least_row(rows: BarrierRows) -> BarrierRows:
     wide = k[..., None].expand(-1, -1, rows.Lg_phi.shape[-1])
     return BarrierRows(
         rows.h.gather(-1, k),
+        rows.hdot.gather(-1, k),
         rows.phi.gather(-1, k),
         rows.Lf_phi.gather(-1, k),
         rows.Lg_phi.gather(-2, wide),
@@ -55,30 +56,33 @@ def closed_form_critics(
 
 
 def feasibility_margin(
-    rows: BarrierRows, v: Any, u_des: Any, d_p: Any, u_max: Any, config: FilterConfig, passive: Any
+    rows: BarrierRows, v: Any, u_des: Any, d_p: Any, u_max: Any, config: FilterConfig, passive: bool
 ) -> Any:
     """Exact margin of the runtime QP's barrier rows, torque box and passivity row together, (B,).
 
-    ``max_u min_k (psi_k(u) + alpha (phi_k - margin)) / authority_k`` over ``|u| <= u_max``, ``vᵀ(u - u_des) <= d_p``,
-    where ``authority_k = Σ_i |L_gφ_k,i| u_max,i`` makes it dimensionless. It is negative where the QP has no solution.
+    ``max_u min_k (psi_k(u) + alpha (phi_k - margin) + fast_alpha max(0, min(ḣ_k, phi_k))) / authority_k`` over
+    ``|u| <= u_max``, ``vᵀ(u - u_des) <= d_p``, where
+    ``authority_k = Σ_i |L_gφ_k,i| u_max,i`` makes it dimensionless. It is negative where the QP has no solution.
     Where not even the box alone allows the power, it is ``-1`` minus the power that is too much, relative to
     ``|v| · u_max``. The gradient is the envelope theorem's: multipliers and torque of the optimum are held fixed.
 
     Args:
         rows: of B states.
         v, u_des: (B, nv).
-        d_p: (B,) [W].
+        d_p: (B,) [W], what is allowed beyond it included.
         u_max: (nv,).
-        config: alpha and margin of the filter.
-        passive: (B,) whether the passivity row is asked for.
+        config: gains and margin of the filter.
+        passive: whether the passivity row is asked for.
     """
     authority = (rows.Lg_phi.abs() * u_max).sum(-1) + _TINY
     level = rows.phi.detach()  # states are drawn at a level of phi: moving the level is no way to gain margin
-    offset = (rows.Lf_phi + config.alpha * (level - config.margin)) / authority  # (B, R)
+    separating = torch.minimum(rows.hdot.detach(), level).clamp(min=0.0)
+    wanted = config.alpha * (level - config.margin) + config.fast_alpha * separating
+    offset = (rows.Lf_phi + wanted) / authority  # (B, R)
     c = rows.Lg_phi * u_max / authority[..., None]
     power = v * u_max
     scale = power.abs().sum(-1) + _TINY
-    budget = torch.where(passive, ((v * u_des).sum(-1) + d_p) / scale, torch.ones_like(d_p))
+    budget = ((v * u_des).sum(-1) + d_p) / scale if passive else torch.ones_like(d_p)
     best = best_worst_row(offset.detach(), c.detach(), power / scale[..., None], budget.clamp(min=-1.0))
     share, z = best.share.to(c.dtype), best.z.to(c.dtype)
     margin = (share * (offset + (c * z[..., None, :]).sum(-1))).sum(-1)

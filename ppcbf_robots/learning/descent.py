@@ -46,6 +46,7 @@ class Descent(ABC):
         self.rays, self.volume = self._pool()
         params = initial_parameters(problem, preset, self.generator)
         self.params: Tensors = {k: x.to(self.device, self.dtype) for k, x in params.items()}
+        self.judged: Tensors = self.params  # what checks and evidence look at
         self.trained = [k for k in self.params if k not in CONSTANTS]
         self.optimizer = torch.optim.Adam([self.params[k].requires_grad_() for k in self.trained])
         passive = kind == "pp-ncbf"
@@ -109,30 +110,34 @@ class Descent(ABC):
         for group in self.optimizer.param_groups:
             group["lr"] = self.preset.learning_rate * max(LAST_RATE, 1.0 - self.iteration / self.preset.iterations)
 
-    def sample(self, count: int, pool: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def sample(
+        self, count: int, pool: torch.Tensor | None = None, params: Tensors | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Band states at random levels of phi on random rays (of ``pool``): ray indices, s, and which rays cross.
 
-        Only the states that cross come back, with the mask (count,) of all.
+        Only the states that cross come back, with the mask (count,) of all. The band is that of ``params``, by default
+        those in training.
         """
         index = torch.randint(len(self.rays) if pool is None else len(pool), (count,), generator=self.generator)
         index = index.to(self.device) if pool is None else pool[index.to(self.device)]
         level = torch.rand(count, generator=self.generator).to(self.device, self.dtype) * self.epsilon
-        s, crosses = self.band.field.on_band(self.params, self.rays.select(index), level)
+        s, crosses = self.band.field.on_band(params or self.params, self.rays.select(index), level)
         return index[crosses], s[crosses], crosses
 
     @torch.no_grad()
     def volume_kept(self) -> float:
         """Volume of the safe set over that of the LB set, on uniform states of X."""
-        K = self.band.field.K(self.params, self.volume.q, self.volume.v)[0]
+        K = self.band.field.K(self.judged, self.volume.q, self.volume.v)[0]
         lb = self.volume.rho >= 0.0
         return float((self.volume.rho - K >= 0.0).sum() / lb.sum().clamp(min=1))
 
     def snapshot(self) -> dict[str, Array]:
         """The parameters as float64 arrays."""
-        return {k: x.detach().cpu().double().numpy().copy() for k, x in self.params.items()}
+        return {k: x.detach().cpu().double().numpy().copy() for k, x in self.judged.items()}
 
     def load(self, params: dict[str, Array]) -> None:
         """Replace the parameters' values."""
         with torch.no_grad():
             for k, x in params.items():
                 self.params[k].copy_(self._tensor(x))
+                self.judged[k].copy_(self._tensor(x))

@@ -1,6 +1,6 @@
 """Search for band states without a feasible torque for the runtime filter: descent on the exact margin, many starts.
 
-The margin is a function of q and of the direction d of v; the speed follows from the level of phi. Gradients are finite
+The margin is a function of q, of the direction d of v and of the level of phi; the speed follows. Gradients are finite
 differences through Pinocchio and the geometry, all starts at once; the differences themselves are candidates too, so
 that kinks (another row, another vertex of the box) do not stop the search.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,25 +54,31 @@ class Falsifier:
     def __init__(self, problem: Problem, band: Band, rows: int, rng: np.random.Generator) -> None:
         self.problem, self.band, self.rows, self.rng = problem, band, rows, rng
         domain = problem.robot.domain
-        self._low = np.concatenate([domain.q[:, 0], domain.v[:, 0]])
-        self._high = np.concatenate([domain.q[:, 1], domain.v[:, 1]])
+        self._low = np.concatenate([domain.q[:, 0], domain.v[:, 0], [0.0]])
+        self._high = np.concatenate([domain.q[:, 1], domain.v[:, 1], [1.0]])
         self._width = self._high - self._low
 
     def margins(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
-        """Least margins (B,) of points (B, 2 nv) of angles and directions, infinite off the band, and states q, v."""
+        """Margins (B,) of points (B, 2 nv + 1), infinite off the band, and their states q, v.
+
+        A point is an angle and a direction of motion for each joint, and the level of phi over epsilon.
+        """
         nq, nv = self.problem.model.nq, self.problem.model.nv
         if not len(points):
             return np.zeros(0), np.zeros((0, nq)), np.zeros((0, nv))
         q = self.problem.model.from_angles(points[:, :nv])
-        arrays, _, free = rays_at(self.problem, q, points[:, nv:], self.rows)
+        arrays, _, free = rays_at(self.problem, q, points[:, nv:-1], self.rows)
         device, dtype = self.band.u_max.device, self.band.u_max.dtype
         index = np.flatnonzero(free)
         margin, v = np.full(len(points), np.inf), np.zeros((len(points), nv))
         if len(index):
             rays = Rays(**to_tensors([{k: x[index] for k, x in arrays.items()}], device, dtype))
-            least, s = self.band.least_margin(params, rays)
-            margin[index] = least.cpu().numpy()
-            v[index] = (s[:, None] * rays.d).cpu().numpy()
+            level = torch.as_tensor(points[index, -1] * self.band.epsilon, device=device, dtype=dtype)
+            s, crosses = self.band.field.on_band(params, rays, level)
+            on = crosses.nonzero()[:, 0]
+            index, chosen = index[on.cpu().numpy()], rays.select(on)
+            margin[index] = self.band.margin(params, chosen, s[on]).detach().cpu().numpy()
+            v[index] = (s[on, None] * chosen.d).cpu().numpy()
         return margin, q, v
 
     def search(
@@ -81,7 +88,7 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Array | None = None,
     ) -> Attack:
-        """Descend from the worst of random points, or ``starts`` (B, 2 nv), until rounds or seconds are used up."""
+        """Descend from the worst of random points, or ``starts`` (B, 2 nv + 1), until rounds or seconds are used up."""
         began, done = time.monotonic(), 0
         points, value, found, evaluated = self._fresh(params, STARTS) if starts is None else self._seen(params, starts)
         step = np.full(len(points), FIRST_STEP)
@@ -169,8 +176,10 @@ def falsify(
 
 
 def no_network(problem: Problem) -> dict[str, Array]:
-    """Parameters of a convex form that is zero everywhere: no units."""
+    """Parameters of a convex form that is zero everywhere: no units, and no weight of the speed."""
     nq, nv = problem.model.nq, problem.model.nv
-    shapes = {"in_shift": nq, "in_scale": nq, "turns": nq, "v_scale": nv, "ba": 0, "bb": 0, "bc": 0}
+    shapes: dict[str, Any] = {f"{form}_{k}": () for form in ("cone", "bowl") for k in "ac"}
+    shapes |= {"in_shift": nq, "in_scale": nq, "turns": nq, "v_scale": nv, "cone_b": nv, "bowl_b": nv}
+    shapes |= {"ba": 0, "bb": 0, "bc": 0}
     heads = {name: np.zeros((3 * nq, 0)) for name in ("Wa", "Wb", "Wc")}
     return {name: np.zeros(size) for name, size in shapes.items()} | heads

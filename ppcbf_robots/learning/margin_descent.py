@@ -23,19 +23,20 @@ from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
+AVERAGING = 0.03  # of the parameters per iteration, in the average that checks and evidence look at
 NEAR = 4.0  # times the wanted margin: rays below it are drawn as often as all others together
 FAR_AWAY = 1.0  # margin noted for rays that do not cross the band
 EXPLORED = 1_600  # new rays per check, around those of small margin
 SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
 POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
-LEAST_WEIGHT = 0.2  # of the largest
+LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.5  # factor on the wanted margin per refinement
+STRICTER = 1.2  # factor on the wanted margin per refinement
 MAX_MARGIN = 0.3
 SIMPLER = 1.5  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
-HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
+HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
 class MarginDescent(Descent):
@@ -48,6 +49,7 @@ class MarginDescent(Descent):
         self._max_weight, self._simplicity = preset.volume_weight, preset.simplicity
         self._weight: torch.Tensor = torch.tensor(preset.volume_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
+        self.judged = {k: x.detach().clone() for k, x in self.params.items()}
         self._look()
 
     def iterate(self) -> None:
@@ -80,6 +82,9 @@ class MarginDescent(Descent):
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.loss = loss.detach()
+        with torch.no_grad():
+            for k in self.trained:
+                self.judged[k].lerp_(self.params[k], AVERAGING)
         violated = (margin[:drawn] < 0.0).to(self.dtype).mean() > VIOLATED
         factor = torch.where(violated, WEIGHT_FALL, WEIGHT_GROWTH)
         self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
@@ -100,17 +105,17 @@ class MarginDescent(Descent):
         """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
         found = self._explore()
         self._look()
-        attack = self.falsifier.search(self.params, rounds=self.preset.search_rounds, starts=self._starts())
+        attack = self.falsifier.search(self.judged, rounds=self.preset.search_rounds, starts=self._starts())
         if len(attack.q):
             self.add_counterexamples(attack.q, attack.v)
             self._look()
         with torch.no_grad():
-            index, s, crosses = self.sample(CHECK_STATES)
+            index, s, crosses = self.sample(CHECK_STATES, params=self.judged)
             if not len(index):
                 return 0.0, 0.0, 0.0
             rays = self.rays.select(index)
-            fails = self.band.margin(self.params, rays, s) < 0.0
-            alone = self.band.margin(self.params, rays, s, passive=False) < 0.0
+            fails = self.band.margin(self.judged, rays, s) < 0.0
+            alone = self.band.margin(self.judged, rays, s, passive=False) < 0.0
             torque = max(float(alone.float().mean()), found, float(len(attack.q) > 0) / CHECK_STATES)
             return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
 
@@ -131,7 +136,7 @@ class MarginDescent(Descent):
         chosen = least[torch.randperm(len(least), generator=self.generator)[:STARTS].to(self.device)]
         rays = self.rays.select(chosen)
         angles = self.problem.model.to_angles(rays.q.cpu().double().numpy())
-        return np.concatenate([angles, rays.d.cpu().double().numpy()], 1)
+        return np.concatenate([angles, rays.d.cpu().double().numpy(), self.rng.random((len(angles), 1))], 1)
 
     def _explore(self) -> float:
         """New rays about those of least margin; the share of them that violate."""
@@ -152,7 +157,7 @@ class MarginDescent(Descent):
         angles = angles + size * self.rng.normal(size=d.shape) * np.ptp(domain.q, axis=1)
         d = d + size * self.rng.normal(size=d.shape) * np.ptp(domain.v, axis=1)
         rays = self.rays_through(model.from_angles(np.clip(angles, domain.q[:, 0], domain.q[:, 1])), d)
-        least = self.band.least_margin(self.params, rays)[0]
+        least = self.band.least_margin(self.judged, rays)[0]
         small = (least < NEAR * self.margin).nonzero()[:, 0]
         self._join(rays.select(small), least[small])
         return float((least < 0.0).float().mean())
@@ -193,6 +198,7 @@ class MarginDescent(Descent):
         """Rays that joined and the margins noted; weights and margin."""
         added = self.rays.select(slice(self._first_pool, None))
         tensors = {f"rays/{k}": x for k, x in vars(added).items()}
+        tensors |= {f"judged/{k}": self.judged[k] for k in self.trained}
         tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
         return tensors, {"margin": self.margin, "max_weight": self._max_weight, "simplicity": self._simplicity}
 
@@ -202,6 +208,7 @@ class MarginDescent(Descent):
             **{k.removeprefix("rays/"): x.to(self.device) for k, x in tensors.items() if k.startswith("rays/")}
         )
         self.rays = self.rays.select(slice(self._first_pool)).join(added)
+        self.judged |= {k: tensors[f"judged/{k}"].to(self.device) for k in self.trained}
         self._noted, self._weight, self._crossing, self._near = (
             tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")
         )

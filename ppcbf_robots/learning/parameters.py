@@ -35,6 +35,11 @@ def initial_parameters(problem: Problem, preset: Preset, generator: torch.Genera
         return p
     nv, units = problem.model.nv, preset.units
     p["v_scale"] = 1.0 / v_max
+    mean_square = nv / 3.0  # of |v / v_max| over X
+    for form, a, b, c in (("cone", 0.15, 1.0, 0.05), ("bowl", 0.06, math.sqrt(5.0 / mean_square), 5.0)):
+        c = c if form == "bowl" else math.log(math.expm1(c))
+        p[f"{form}_a"], p[f"{form}_c"] = (torch.tensor(x, dtype=torch.float64) for x in (math.log(math.expm1(a)), c))
+        p[f"{form}_b"] = torch.full((nv,), b, dtype=torch.float64)
     p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -3.0, dtype=torch.float64)
     p["Wc"], p["bc"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -1.0, dtype=torch.float64)
     p["Wb"], _ = _linear(width, units * nv, generator)

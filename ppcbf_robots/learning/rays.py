@@ -21,7 +21,7 @@ from ppcbf_robots.specs import Array
 
 RayArrays = dict[str, Array]
 CHUNK = 2000  # configurations evaluated at once, to bound memory
-BISECTIONS = 6  # before the last step, which is a secant
+BISECTIONS = 8  # before the last step, which is a secant
 FAR = 5.0  # [m/s], rho above which a row cannot matter
 
 
