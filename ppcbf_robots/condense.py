@@ -71,6 +71,23 @@ def condense(
 
 
 @kernel
+def hold_at(
+    phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
+    alpha: float, speed_alpha: float, margin: float, flat: float, tolerance: float, hold: Any,
+) -> None:  # fmt: skip
+    """Whether all rows of :func:`condense` hold at u_des, and u_des is in the box, for a batch: hold (B,) is filled."""
+    count, nv = phi.shape[1] + 2 * len(v_domain), len(u_max)
+    C, lower, norm, binding = np.empty((count, nv)), np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
+    for s in range(len(v)):
+        _, hold[s] = condense(
+            phi[s], Lf[s], Lg[s], Minv[s], b[s], v[s], v_domain, u_des[s], u_max,
+            alpha, speed_alpha, margin, flat, tolerance, C, lower, norm, binding,
+        )  # fmt: skip
+        for j in range(nv):
+            hold[s] = hold[s] and abs(u_des[s, j]) <= u_max[j]
+
+
+@kernel
 def pick(C: Any, lower: Any, chosen: Any, row: Any, bound: float, with_row: bool) -> tuple[Any, Any]:
     """The chosen rows and their bounds in arrays of their own, with one more row (nv,) at the end if asked for."""
     count, nv = len(chosen), C.shape[1]

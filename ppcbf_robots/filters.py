@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.condense import condense, hessian, nearest, pick, verify
+from ppcbf_robots.condense import condense, hessian, hold_at, nearest, pick, verify
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -140,6 +140,10 @@ class ClosedForm:
             return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
         return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
 
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
+        """As :meth:`QPFilter.passes`; nothing is known before each state is looked at."""
+        return np.zeros(len(u_des), dtype=np.bool_)
+
     def _damp(self, dyn: Dynamics, safety: SafetyRows, k: int, u_des: Array) -> Correction:
         """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one period.
 
@@ -187,15 +191,28 @@ class QPFilter:
         self.barrier, self.safety, self.config = barrier, safety, config
         self.solver: QPSolver = make_solver(config.solver)
 
+    def _class_k(self) -> tuple[float, float, float]:
+        """Class-K gain of the barrier's rows and of the velocity domain [1/s], and the margin kept off phi."""
+        if self.barrier.kind == "pp-cbf":
+            return self.barrier.spec.gamma_K, self.config.speed_alpha, 0.0
+        return self.config.alpha, self.config.speed_alpha, self.config.margin
+
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
+        """Whether :meth:`correct` leaves u_des (B, nv) as it is, (B,), for a batch of states."""
+        hold = np.empty(len(u_des), dtype=np.bool_)
+        hold_at(
+            rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            *self._class_k(), _FLAT, ROW_TOLERANCE, hold,
+        )  # fmt: skip
+        return hold
+
     def _condense(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[QPRows, int, bool]:
-        energy = self.barrier.kind == "pp-cbf"
-        alpha = self.barrier.spec.gamma_K if energy else self.config.alpha
         count, nv = len(rows.phi) + 2 * len(self.safety.v_domain), len(u_max)
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
         binding = np.empty(count, dtype=np.bool_)
         hopeless, hold = condense(
             rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            alpha, self.config.speed_alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE,
+            *self._class_k(), _FLAT, ROW_TOLERANCE,
             C, lower, norm, binding,
         )  # fmt: skip
         return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ppcbf_robots.barriers import Barrier, RhoBarrier
+from ppcbf_robots.barriers import Barrier, BarrierRows, RhoBarrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
-from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.shapes import Motion, Packed
 from ppcbf_robots.specs import Array
 
@@ -34,6 +34,21 @@ class StepResult:
     phi: float  # least over the rows
     row: str  # name of the row that decided, "" if none
     port_power: float = 0.0  # [W] beyond d_p that a moving obstacle puts in through the arm's evasion
+
+
+@dataclass(frozen=True)
+class Screen:
+    """What is known of a batch of states before any QP is solved."""
+
+    free: NDArray[np.bool_]  # (B,) u_des needs no correction
+    safety: SafetyRows
+    rows: BarrierRows
+
+    def at(self, i: int) -> tuple[SafetyRows, BarrierRows]:
+        """The rows of one state."""
+        return SafetyRows(*(x[i] for x in vars(self.safety).values())), BarrierRows(
+            *(x[i] for x in vars(self.rows).values())
+        )
 
 
 class SafetyFilter:
@@ -121,15 +136,28 @@ class SafetyFilter:
         self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None, obstacles: Packed | None = None
     ) -> StepResult:
         """The step for a state that was already evaluated (and checked), with the obstacles where they are now."""
-        self._remember(t, dyn)
         safety = self.safety.evaluate(dyn, obstacles)
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
+        return self.filter_rows(t, dyn, safety, rows, u_des, d_p, obstacles is not None)
+
+    def filter_rows(
+        self,
+        t: float,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        moving: bool = False,
+    ) -> StepResult:
+        """The step for a state whose rows are known too; ``moving`` if they are of obstacles that move."""
+        self._remember(t, dyn)
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
         wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
         if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
             return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi)
-        pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
+        pushed = moving and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
         c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max)
         if c.status is Status.FAULT:
@@ -140,6 +168,17 @@ class SafetyFilter:
         u = c.u - offset
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
+
+    def screen(self, dyn: Dynamics, u_des: Array) -> Screen:
+        """The rows of a batch of valid states, and at which of them the filter leaves u_des (B, nv) as it is.
+
+        For the others :meth:`filter_rows` has to be asked. Counts and the last valid state are left alone.
+        """
+        safety = self.safety.evaluate(dyn)
+        rows = self.barrier.rows(dyn, safety)
+        total = u_des if self.gravity_included else u_des + dyn.g
+        free = self.correction.passes(dyn, rows, total, self.robot.u_max)
+        return Screen(free, safety, rows)
 
     def _remember(self, t: float, dyn: Dynamics) -> None:
         """This state is valid: what an invalid one after it is bridged with."""
