@@ -17,6 +17,7 @@ from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
 from ppcbf_robots.resources import portable
+from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.rollout import RK4_STEP, Trajectory
 from ppcbf_robots.rollout import simulate as rollout
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -119,29 +120,33 @@ def run(
     engine: EngineName = "pinocchio",
 ) -> Trajectory:
     """A rollout with a progress bar; meta names robot, world, barrier and filter."""
-    moved_by = _mujoco(problem) if engine == "mujoco" else None
+    moved_by = mujoco_engine(problem) if engine == "mujoco" else None
     runtime = None
     if barrier is not None:
         runtime = SafetyFilter(problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd)
-    described = {
-        "robot": portable(problem.robot.name),
-        "obstacles": portable(problem.world_name),
-        "barrier_kind": barrier.kind if barrier else "none",
-        "filter": config.kind if barrier else "none",
-        "metric": config.metric if barrier else "none",
-        **meta,
-    }
     ticks = iter(track(range(max(1, round(duration / config.dt) // 50)), "simulating", console=err, transient=True))
     trajectory = rollout(
-        problem.safety, problem.robot.controller, runtime, q, v, duration, config.dt, described,
-        on_step=lambda t: next(ticks, None), engine=moved_by,
+        problem.safety, problem.robot.controller, runtime, q, v, duration, config.dt,
+        described(problem, barrier, config) | meta, on_step=lambda t: next(ticks, None), engine=moved_by,
     )  # fmt: skip
     for _ in ticks:
         pass
     return trajectory
 
 
-def _mujoco(problem: Problem) -> Engine:
+def described(problem: Problem, barrier: Barrier | None, config: FilterConfig) -> dict[str, Any]:
+    """What a trajectory's meta says of how it was made."""
+    return {
+        "robot": portable(problem.robot.name),
+        "obstacles": portable(problem.world_name),
+        "barrier_kind": barrier.kind if barrier else "none",
+        "filter": config.kind if barrier else "none",
+        "metric": config.metric if barrier else "none",
+    }
+
+
+def mujoco_engine(problem: Problem, plant: RobotModel | None = None) -> Engine:
+    """MuJoCo with the problem's robot, or another plant; InputError where it is not installed."""
     try:
         from ppcbf_robots.engine_mujoco import MujocoEngine  # MuJoCo only where it is asked for
     except ModuleNotFoundError as error:
@@ -150,7 +155,7 @@ def _mujoco(problem: Problem) -> Engine:
         raise InputError(
             '--engine mujoco needs the mujoco package; remedy: pip install "ppcbf-robots[mujoco]"'
         ) from None
-    return MujocoEngine(problem)
+    return MujocoEngine(problem, plant)
 
 
 def _angles(problem: Problem, text: str | None, what: str, default: Array) -> Array:

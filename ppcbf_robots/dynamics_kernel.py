@@ -183,7 +183,9 @@ def _solve(L: Any, x: Any) -> None:
 
 
 @kernel
-def terms_at(q: Any, v: Any, tree: Any, bodies: Any, T: Any, J: Any, dJ: Any, M: Any, Minv: Any, b: Any, g: Any) -> None:
+def terms_at(
+    q: Any, v: Any, tree: Any, bodies: Any, T: Any, J: Any, dJ: Any, M: Any, Minv: Any, b: Any, g: Any
+) -> None:
     """Terms of :class:`ppcbf_robots.robot.Dynamics` (b for Cv) of a batch; all but ``tree`` have a leading axis B."""
     n = v.shape[1]
     work, L = scratch(n), np.zeros((n, n))

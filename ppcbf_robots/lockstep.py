@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ppcbf_robots.batch_dynamics import BatchDynamics
 from ppcbf_robots.barriers import Barrier
+from ppcbf_robots.batch_dynamics import BatchDynamics
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.pushes import Push, push_torques
