@@ -54,10 +54,8 @@ class Chunk:
         """Every case with its run."""
         problem, barrier, config = self.load()
         cases = [draw(problem, barrier, self.drawing, index) for index in self.numbers]
-        meta = described(problem, barrier, config) | {
-            "barrier": self.barrier,
-            "campaign": dataclasses.asdict(self.drawing),
-        }
+        meta = {**described(problem, barrier, config), "barrier": self.barrier}
+        meta["campaign"] = dataclasses.asdict(self.drawing)
         other = functools.partial(mujoco_engine, problem) if self.engine == "mujoco" else None
         runs = run_cases(problem, barrier, config, cases, self.drawing.duration, other, meta)
         for index, case, run in zip(self.numbers, cases, runs, strict=True):
@@ -130,9 +128,7 @@ def campaign(
     ] = None,
     out_path: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="DIR", help="Folder for results; with some, goes on from there. With --replay: T.npz."
-        ),
+        typer.Option("--out", metavar="DIR", help="Folder for results, by default ./campaign; with --replay, T.npz."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -218,16 +214,18 @@ def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
     title = f"{problem.robot.name} in {problem.world_name}: {facts['rollouts']} runs of {facts['duration']:g} s"
     title += f", {facts['barrier_kind']}, {facts['filter']}, {facts['engine']}" + "".join(f", {x}" for x in given)
     worst = facts["worst"]
+    torque = f"(most {facts['max_torque_ratio']:.4f} of it, run {worst['torque']})"
+    injected = f"(run {worst['injected']}; median {facts['median_injected']:.2g})"
     rows = [
         ["runs with a contact", str(facts["contacts"])],
-        ["runs beyond a torque limit", f"{facts['torque_violations']} (most {facts['max_torque_ratio']:.4f} of it, run {worst['torque']})"],
+        ["runs beyond a torque limit", f"{facts['torque_violations']} {torque}"],
         ["runs beyond a torque rate limit", str(facts["rate_violations"])],
         ["runs beyond a joint limit", str(facts["limit_violations"])],
         ["runs that diverged", str(facts["diverged"])],
         ["least h", f"{facts['min_h']:.6f} (run {worst['min_h']}; median of the runs {facts['median_min_h']:.4f})"],
         ["least clearance [m]", f"{facts['min_clearance']:.6f}"],
         ["most energy above V0 and pushes [J]", f"{facts['max_energy_rise']:.3g}"],
-        ["most energy injected [J]", f"{facts['max_injected']:.3g} (run {worst['injected']}; median {facts['median_injected']:.2g})"],
+        ["most energy injected [J]", f"{facts['max_injected']:.3g} {injected}"],
         ["steps without a solution", str(facts["qp_failures"])],
         ["steps below the full QP", str(facts["fallbacks"])],
         ["ended at the goal", str(facts["goals_reached"])],

@@ -1,4 +1,4 @@
-"""A robot's dynamics for many states at once (see :mod:`ppcbf_robots.dynamics_kernel`), read from its Pinocchio model."""
+"""A robot's dynamics for many states at once, read from its Pinocchio model."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class BatchDynamics:
         self._bodies = np.array([unique[id(r)] for r in robots])
 
     def evaluate(self, q: Array, v: Array) -> Dynamics:
-        """As :meth:`ppcbf_robots.robot.RobotModel.evaluate`; q (B, nq), v (B, nv), every array with a leading axis B."""
+        """As :meth:`ppcbf_robots.robot.RobotModel.evaluate_batch`; q (B, nq), v (B, nv)."""
         B, n = v.shape
         T, J, dJ = np.empty((B, n + 1, 4, 4)), np.empty((B, 6, n)), np.empty((B, 6, n))
         M, Minv, b, g = np.empty((B, n, n)), np.empty((B, n, n)), np.empty((B, n)), np.empty((B, n))

@@ -135,13 +135,13 @@ def run_cases(
 def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     """Figures of one run as JSON.
 
-    ``min_h`` (least h over all rows [m | rad]), ``clearance`` (over obstacles and self-collision pairs [m]), ``contact``
-    (where the engine knows contacts, of the links themselves; else a clearance below 0), ``beyond_limit`` (a joint more
-    than 0.1 mrad or mm beyond its limit), ``torque`` (largest |u_i| / u_max,i), ``rate`` (largest change of torque over its limit, 0 without
-    limits), ``energy_rise`` [J] (the most by which V exceeds V0 and the pushes' work so far), ``injected`` [J] (its
-    largest rise over its running minimum, less that work), ``push_work`` [J], ``qp_failures`` (steps in which no torque
-    satisfies all rows, or the solver gave none), ``fallbacks`` (steps below the QP with all its rows), ``state`` (how
-    the run ended, or ``diverged``), ``goal_error``.
+    ``min_h`` (least h over all rows [m | rad]), ``clearance`` (over obstacles and self-collision pairs [m]),
+    ``contact`` (where the engine knows contacts, of the links themselves; else a clearance below 0), ``beyond_limit``
+    (a joint more than 0.1 mrad or mm beyond its limit), ``torque`` (largest |u_i| / u_max,i), ``rate`` (largest change
+    of torque over its limit, 0 without limits), ``energy_rise`` [J] (the most by which V exceeds V0 and the pushes'
+    work so far), ``injected`` [J] (its largest rise over its running minimum, less that work), ``push_work`` [J],
+    ``qp_failures`` (steps in which no torque satisfies all rows, or the solver gave none), ``fallbacks`` (steps below
+    the QP with all its rows), ``state`` (how the run ended, or ``diverged``), ``goal_error``.
     """
     contacts, end = run.meta["contacts"], run.ending()
     known = np.isfinite(run.h) & np.isfinite(run.V) & np.isfinite(run.u).all(axis=1)  # not all of a run that diverges
@@ -185,7 +185,7 @@ def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
     """Figures of a campaign from those of its runs, by their numbers.
 
     ``contacts``, ``limit_violations``, ``torque_violations``, ``rate_violations`` and ``diverged`` count runs,
-    ``qp_failures`` and ``fallbacks`` control steps. ``worst`` holds the runs of least h, most energy and largest torque.
+    ``qp_failures`` and ``fallbacks`` control steps. ``worst`` holds the runs of least h, most energy and most torque.
     """
     runs = list(outcomes.values())
 

@@ -53,12 +53,12 @@ def _kinematics(q: Any, v: Any, tree: Any, V: Any, T: Any, J: Any, dJ: Any) -> N
             J[0, i], J[1, i], J[2, i], J[3, i], J[4, i], J[5, i] = ax, ay, az, 0.0, 0.0, 0.0
         else:
             c, s = (q[at], q[at + 1]) if kinds[i] == WRAPS else (math.cos(q[at]), math.sin(q[at]))
-            k = 1.0 - c
+            e = 1.0 - c
             for r in range(3):
                 a0, a1, a2 = A[r, 0], A[r, 1], A[r, 2]
-                here[r, 0] = a0 * (c + k * x * x) + a1 * (k * x * y + s * z) + a2 * (k * x * z - s * y)
-                here[r, 1] = a0 * (k * x * y - s * z) + a1 * (c + k * y * y) + a2 * (k * y * z + s * x)
-                here[r, 2] = a0 * (k * x * z + s * y) + a1 * (k * y * z - s * x) + a2 * (c + k * z * z)
+                here[r, 0] = a0 * (c + e * x * x) + a1 * (e * x * y + s * z) + a2 * (e * x * z - s * y)
+                here[r, 1] = a0 * (e * x * y - s * z) + a1 * (c + e * y * y) + a2 * (e * y * z + s * x)
+                here[r, 2] = a0 * (e * x * z + s * y) + a1 * (e * y * z - s * x) + a2 * (c + e * z * z)
                 here[r, 3] = A[r, 3]
             px, py, pz = A[0, 3], A[1, 3], A[2, 3]
             J[0, i], J[1, i], J[2, i] = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax

@@ -56,7 +56,7 @@ def simulate_together(
     filters = [SafetyFilter(model, problem.safety, barrier, config, kd) for _ in cases] if barrier else []
     substeps = max(1, round(config.dt / RK4_STEP))
     dt = substeps * RK4_STEP
-    t = np.arange(max(1, round(duration / dt)) + 1) * dt
+    t = dt * np.arange(max(1, round(duration / dt)) + 1, dtype=float)
     nominal, moved = (BatchDynamics([x or model for x in robots])
                       for robots in ([None] * len(cases), [c.plant for c in cases]))  # fmt: skip
     q, v, goals = (np.array([getattr(c, name) for c in cases]) for name in ("q", "v", "goal"))
@@ -72,7 +72,7 @@ def simulate_together(
         if filters:
             screen = filters[0].screen(dyn, wanted.u)
             h, phi = screen.safety.h, screen.rows.phi.min(axis=1)
-            for i in np.flatnonzero(~screen.free & ~over):
+            for i in map(int, np.flatnonzero(~screen.free & ~over)):
                 result = filters[i].filter_rows(
                     float(now), _state(dyn, i), *screen.at(i), wanted.u[i], float(wanted.d_p[i])
                 )
