@@ -114,7 +114,7 @@ def campaign(
     ] = "pinocchio",
     duration: Annotated[float, typer.Option(min=0.01, max=600.0, help="Simulated seconds of each run.")] = 5.0,
     pushes: Annotated[
-        bool, typer.Option("--pushes", help="Push the arm: 1 to 3 pulses of up to 10 % of u_max and 0.2 s in each run.")
+        bool, typer.Option("--pushes", help="Push the arm 1 to 3 times a run; a joint gains up to 10 % of v_max.")
     ] = False,
     mass_error: Annotated[
         float,
@@ -209,7 +209,7 @@ def _replay(one: Chunk, path: Path, json: bool) -> None:
 
 
 def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
-    given = ["pushes of up to 10 % of u_max"] if facts["pushes"] else []
+    given = ["pushes of up to 10 % of v_max"] if facts["pushes"] else []
     given += [f"masses off by up to {facts['mass_error']:.0%}"] if facts["mass_error"] else []
     title = f"{problem.robot.name} in {problem.world_name}: {facts['rollouts']} runs of {facts['duration']:g} s"
     title += f", {facts['barrier_kind']}, {facts['filter']}, {facts['engine']}" + "".join(f", {x}" for x in given)

@@ -28,7 +28,7 @@ CLEAR = 0.01  # [m | rad], least h of starts and goals
 TRIES = 20_000  # configurations for one start or goal
 SPEEDS = 10  # velocities tried per start configuration
 MAX_PUSHES = 3
-PUSH_SHARE = 0.1  # of u_max, largest torque of a push on each joint
+PUSH_SPEED = 0.1  # of v_max, by which a push changes the speed of each joint at most, at the start configuration
 PUSH_SECONDS = (0.05, 0.2)
 TORQUE_TOLERANCE = 1e-9  # of u_max
 LIMIT_TOLERANCE = 1e-4  # [rad | m] beyond a joint limit: less is what a held torque slips within a control period
@@ -58,7 +58,7 @@ def draw(problem: Problem, barrier: Barrier | None, drawing: Drawing, index: int
     where, outside, inside = np.random.default_rng([drawing.seed, index]).spawn(3)
     q, v = _start(problem, barrier, where)
     goal = next(_clear(problem, where))
-    pushes = list(_pushes(problem.model, drawing.duration, outside)) if drawing.pushes else []
+    pushes = list(_pushes(problem.model, q, drawing.duration, outside)) if drawing.pushes else []
     plant = None
     if drawing.mass_error > 0.0:
         factors = inside.uniform(1.0 - drawing.mass_error, 1.0 + drawing.mass_error, problem.model.nv)
@@ -92,11 +92,13 @@ def _start(problem: Problem, barrier: Barrier | None, rng: np.random.Generator) 
     raise AssertionError("_clear ends with an error")
 
 
-def _pushes(model: RobotModel, duration: float, rng: np.random.Generator) -> Iterator[Push]:
+def _pushes(model: RobotModel, q: Array, duration: float, rng: np.random.Generator) -> Iterator[Push]:
+    """Pulses ``M(q) Δv / lasting`` of torque: shares of u_max would be far too much for a light wrist."""
+    M = model.evaluate(q, np.zeros(model.nv)).M
     for _ in range(int(rng.integers(1, MAX_PUSHES + 1))):
         lasting = float(np.round(rng.uniform(*PUSH_SECONDS), 3))
         start = float(np.round(rng.uniform(0.0, max(0.0, duration - lasting)), 3))
-        yield Push(start, lasting, rng.uniform(-PUSH_SHARE, PUSH_SHARE, model.nv) * model.u_max)
+        yield Push(start, lasting, M @ (rng.uniform(-PUSH_SPEED, PUSH_SPEED, model.nv) * model.v_max) / lasting)
 
 
 def run_cases(
@@ -158,7 +160,7 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
         "contact": clearance < 0.0 if contacts is None else contacts["steps"] > 0,
         "beyond_limit": bool(beyond.any()),
         "torque": float(np.max(np.abs(run.u[known]) / problem.model.u_max)),
-        "rate": _rate(problem.model, run),
+        "rate": _rate(problem.model, run.u[known], float(run.t[-1]) / max(1, len(run.t) - 1)),
         "energy_rise": float(np.max(unexplained) - unexplained[0]),
         "injected": float(np.max(unexplained - np.minimum.accumulate(unexplained))),
         "push_work": float(work[-1]),
@@ -177,8 +179,9 @@ def _push_work(model: RobotModel, case: Case, run: Trajectory) -> Array:
     return np.concatenate([[0.0], np.cumsum((pushed * moved).sum(axis=1))])
 
 
-def _rate(model: RobotModel, run: Trajectory) -> float:
-    return 0.0
+def _rate(model: RobotModel, u: Array, dt: float) -> float:
+    """Largest change of torque from one control step to the next over what the rate limits allow."""
+    return float(np.max(np.abs(np.diff(u, axis=0)) / (model.u_rate * dt), initial=0.0))
 
 
 def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:

@@ -42,7 +42,9 @@ def simulate_together(
     duration: float,
     meta: dict[str, Any] | None = None,
 ) -> list[Trajectory]:
-    """The trajectories of all cases, each with a filter of its own, in Pinocchio's dynamics without contact.
+    """The trajectories of all cases, each with a filter of its own, without contact.
+
+    States are taken as valid: what the filter does about stale or torn measurements does not come into it.
 
     Args:
         problem: robot, world and controller; the goals are those of the cases.
@@ -73,9 +75,7 @@ def simulate_together(
             screen = filters[0].screen(dyn, wanted.u)
             h, phi = screen.safety.h, screen.rows.phi.min(axis=1)
             for i in map(int, np.flatnonzero(~screen.free & ~over)):
-                result = filters[i].filter_rows(
-                    float(now), _state(dyn, i), *screen.at(i), wanted.u[i], float(wanted.d_p[i])
-                )
+                result = filters[i].step_screened(_state(dyn, i), screen, i, wanted.u[i], float(wanted.d_p[i]))
                 u[i], status[i], row[i] = result.u, result.status, result.row
         else:
             h, phi = problem.safety.evaluate(dyn).h, np.full(len(cases), np.nan)
