@@ -7,6 +7,7 @@ the base frame. Every array of an evaluation may carry a leading batch axis.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -133,16 +134,25 @@ class RobotModel:
         self.model = lock(self.full_model, self.locked)[0]
         self.joint_names = list(self.model.names)[1:]
         if payload is not None:
-            self._add_payload(payload)
+            self.add_payload(payload)
         self.data = self.model.createData()
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
+        self.friction = np.zeros(self.nv)  # Coulomb [N m | N], of a plant alone: `evaluate` and the filter know none
         self._oMi = _strided(self.data.oMi)
         self._index_joints()
         names = self.joint_names
         self.u_max, self.v_max = force_limits(self.urdf, names, facts.joints, effort, velocity)
         self.q_lower, self.q_upper = position_limits(self.urdf, names, facts.joints, position or {}, self.warnings)
 
-    def _add_payload(self, payload: PayloadSpec) -> None:
+    def with_model(self, model: pin.Model) -> RobotModel:
+        """This robot on another Pinocchio model of the same joints and frames."""
+        other = copy.copy(self)
+        other.model, other.data = model, model.createData()
+        other._oMi = _strided(other.data.oMi)
+        return other
+
+    def add_payload(self, payload: PayloadSpec) -> None:
+        """Add a point mass to a frame; InputError if there is none by that name."""
         frame = self.model.frames[self.frame_id(payload.frame)]
         if payload.mass > 0.0:
             inertia = pin.Inertia(payload.mass, np.asarray(payload.com, float), np.zeros((3, 3)))

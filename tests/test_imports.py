@@ -23,7 +23,7 @@ LAYERS = [
     ["urdf", "urdf_parts", "world", "body", "body_geometry", "body_fit", "body_cache"],
     ["shapes", "world_shapes", "joints", "meshes", "mesh_contact"],
     ["robot", "world_files"],
-    ["safety", "controllers", "network", "engines"],
+    ["safety", "controllers", "network", "engines", "plant"],
     ["condense", "ending"],
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["filters"],
