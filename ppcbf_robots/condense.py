@@ -12,7 +12,7 @@ from ppcbf_robots.kernels import kernel
 
 @kernel
 def condense(
-    phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
+    phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any, low: Any, high: Any,
     alpha: float, speed_alpha: float, margin: float, flat: float, tolerance: float,
     C: Any, lower: Any, norm: Any, binding: Any,
 ) -> tuple[int, bool]:  # fmt: skip
@@ -27,6 +27,7 @@ def condense(
         Minv, b, v: of the state.
         v_domain: (nv, 2), or (0, 2) for no such rows.
         u_des, u_max: (nv,).
+        low, high: (nv,) bounds of z.
         alpha: class-K gain [1/s].
         speed_alpha: that of the velocity domain [1/s].
         margin: kept off phi.
@@ -61,8 +62,8 @@ def condense(
         center = reach = 0.0
         for j in range(nv):
             C[k, j] /= scale
-            center -= C[k, j] * u_des[j] / u_max[j]
-            reach += abs(C[k, j])
+            center += 0.5 * C[k, j] * (low[j] + high[j])
+            reach += 0.5 * abs(C[k, j]) * (high[j] - low[j])
         binding[k] = lower[k] > center - reach
         hold = hold and slack >= 0.0
         if k < R and lower[k] > center + reach + tolerance and (hopeless < 0 or lower[k] > worst):

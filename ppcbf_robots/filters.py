@@ -7,7 +7,8 @@ wherever K_theta is convex in v.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal, get_args
 
@@ -22,11 +23,13 @@ from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.specs import Array
 
+log = logging.getLogger(__name__)
+
 Metric = Literal["torque", "kinetic"]
 FilterKind = Literal["closed-form", "qp"]
 
 Row = tuple[Array, float]  # (n,) of length 1 and its lower bound
-Box = tuple[Array, Array]  # (n,) bounds of the dimensionless correction
+Box = tuple[Array, Array]  # (n,) bounds of a torque, or of the dimensionless correction
 Solution = tuple[Array, int]  # dimensionless correction and the row that it rests on, -1 if none
 
 _TINY = 1e-12
@@ -62,6 +65,7 @@ class FilterConfig:
     margin: float = 1e-3  # [m/s], phi kept above by the QP, for the control period's discretisation
     near_rows: int = 16  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
+    max_age: float = 0.005  # [s], how old or how often repeated a state may be before it is invalid
     dt: float = 1e-3  # [s], control period
 
     @property
@@ -74,7 +78,7 @@ class FilterConfig:
         for name, allowed in (("kind", get_args(FilterKind)), ("metric", get_args(Metric))):
             if getattr(self, name) not in allowed:
                 raise InputError(f"filter {name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
-        for name in ("alpha", "dt", "max_hold", "near_rows"):
+        for name in ("alpha", "dt", "max_hold", "max_age", "near_rows"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"filter {name}: must be a positive number, got {getattr(self, name)}")
         if not (np.isfinite(self.margin) and self.margin >= 0.0):
@@ -93,22 +97,29 @@ class Correction:
 
 @dataclass(frozen=True)
 class QPRows:
-    """All rows ``C z >= lower`` of the dimensionless correction; the barrier's first, then the velocity domain's."""
+    """What binds the dimensionless correction z: rows ``C z >= lower``, the barrier's before the velocity domain's, and
+    the box."""
 
     C: Array  # (rows, nv), of length 1
     lower: Array  # (rows,)
     norm: Array  # (rows,) length before, in units of phi̇ per full torque
     binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
     barrier_rows: int
+    box: Box  # (nv,) bounds of z
+    limits: str  # what the box holds, in words
 
     def without_speed(self) -> QPRows:
         """The barrier's rows alone."""
         n = self.barrier_rows
-        return QPRows(self.C[:n], self.lower[:n], self.norm[:n], self.binding[:n], n)
+        return QPRows(self.C[:n], self.lower[:n], self.norm[:n], self.binding[:n], n, self.box, self.limits)
 
 
 class ClosedForm:
-    """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
+    """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to).
+
+    Where the torque's rate is limited, :class:`ppcbf_robots.safety_filter.SafetyFilter` clips its answer to box and
+    rate.
+    """
 
     def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
         self.barrier, self.config = barrier, config
@@ -121,9 +132,25 @@ class ClosedForm:
         return np.asarray(near | (rows.phi <= spec.epsilon))  # a state beyond the band must not pass unfiltered
 
     def correct(
-        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array
+        self,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        u_max: Array,
+        allowed: Box | None = None,
     ) -> Correction:
-        """The paper's correction; d_p and u_max do not enter it."""
+        """The paper's correction; d_p and u_max do not enter it. ``allowed`` bounds clip it, and that is said."""
+        answer = self._formula(dyn, safety, rows, u_des)
+        u = answer.u if allowed is None else np.clip(answer.u, *allowed)
+        if (u == answer.u).all():
+            return answer
+        if answer.status is Status.FREE:
+            return Correction(u, Status.CORRECTING, "u_des clipped to box and rate", -1)
+        return Correction(u, Status.INFEASIBLE, "the correction is clipped to box and rate", answer.row)
+
+    def _formula(self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array) -> Correction:
         active = np.flatnonzero(self._active(rows))
         if not active.size:
             return Correction(u_des, Status.FREE, "outside the band", -1)
@@ -187,48 +214,68 @@ class QPFilter:
         self.barrier, self.safety, self.config = barrier, safety, config
         self.solver: QPSolver = make_solver(config.solver)
 
-    def _condense(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[QPRows, int, bool]:
+    def _condense(
+        self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array, allowed: Box | None
+    ) -> tuple[QPRows, int, bool]:
         energy = self.barrier.kind == "pp-cbf"
         alpha = self.barrier.spec.gamma_K if energy else self.config.alpha
         count, nv = len(rows.phi) + 2 * len(self.safety.v_domain), len(u_max)
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
         binding = np.empty(count, dtype=np.bool_)
+        lowest, highest = allowed or (-u_max, u_max)
+        box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
         hopeless, hold = condense(
-            rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max, *box,
             alpha, self.config.speed_alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE,
             C, lower, norm, binding,
         )  # fmt: skip
-        return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold
+        limits = "box" if allowed is None else "box and rate"
+        return QPRows(C, lower, norm, binding, len(rows.phi), box, limits), hopeless, hold
 
     def correct(
-        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array
+        self,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        u_max: Array,
+        allowed: Box | None = None,
     ) -> Correction:
-        """The least correction in the configured metric, checked before it is returned; ``rows`` say all of safety."""
-        qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max)
-        if hold and np.all(np.abs(u_des) <= u_max):
+        """The least correction in the configured metric, checked before it is returned; ``rows`` say all of safety.
+
+        ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
+        """
+        qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max, allowed)
+        if hold and np.all(qp.box[0] <= 0.0) and np.all(qp.box[1] >= 0.0):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
-        share = u_des / u_max
-        box = (-1.0 - share, 1.0 - share)
+        answer = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
+        return answer if allowed is None else replace(answer, u=np.clip(answer.u, *allowed))
+
+    def _ladder(
+        self, dyn: Dynamics, qp: QPRows, hopeless: int, u_des: Array, d_p: float | None, u_max: Array
+    ) -> Correction:
+        """The QP, and what takes its place where it has no solution."""
         if hopeless >= 0:
             flat = qp.norm[hopeless] < _FLAT
-            reason = "L_g phi is zero on a violated row" if flat else "a row is out of reach of the torque box"
-            z = self._least_violation(dyn, qp, box, u_max)
+            reason = "L_g phi is zero on a violated row" if flat else f"a row is out of reach of the torque {qp.limits}"
+            z = self._least_violation(dyn, qp, u_max)
             return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, hopeless)
         passivity = self._passivity_row(dyn, d_p, u_max)
-        solved, reason = self._solve(dyn, qp, passivity, box, u_max), "constraint active"
+        solved, reason = self._solve(dyn, qp, passivity, u_max), "constraint active"
         if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
             qp, reason = qp.without_speed(), "constraint active, the velocity domain given up"
-            solved = self._solve(dyn, qp, passivity, box, u_max)
+            solved = self._solve(dyn, qp, passivity, u_max)
         if solved is not None:
             return self._answer(solved[0], u_des, u_max, Status.CORRECTING, reason, solved[1])
         if passivity is not None:
-            solved = self._solve(dyn, qp, None, box, u_max)
+            solved = self._solve(dyn, qp, None, u_max)
         if solved is not None:
-            reason = "rows and box allow no passive torque"
+            reason = f"rows and {qp.limits} allow no passive torque"
             return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
-        z = self._least_violation(dyn, qp, box, u_max)
+        z = self._least_violation(dyn, qp, u_max)
         k = int(np.argmax(qp.lower[: qp.barrier_rows]))
-        return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
+        return self._answer(z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", k)
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p as (row, lower) of length 1; None near rest.
@@ -245,9 +292,9 @@ class QPFilter:
     def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
         return np.asarray(hessian(dyn.Minv, u_max, self.config.metric == "kinetic"))
 
-    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, box: Box, u_max: Array) -> Solution | None:
+    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, u_max: Array) -> Solution | None:
         """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
-        H, no_row = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0)
+        H, no_row, box = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0), qp.box
         chosen = nearest(qp.lower, qp.binding, self.config.near_rows)
         missed = np.empty(len(qp.lower), dtype=np.bool_)
         for _ in range(4):
@@ -266,9 +313,9 @@ class QPFilter:
             chosen = np.union1d(chosen, np.flatnonzero(missed))
         return None
 
-    def _least_violation(self, dyn: Dynamics, qp: QPRows, box: Box, u_max: Array) -> Array | None:
+    def _least_violation(self, dyn: Dynamics, qp: QPRows, u_max: Array) -> Array | None:
         """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted."""
-        n = len(u_max)
+        n, box = len(u_max), qp.box
         steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
         if not len(steerable):
             return np.clip(np.zeros(n), *box)
@@ -285,8 +332,12 @@ class QPFilter:
         return None if z is None else np.clip(z[:n], *box)
 
     def _ask(self, problem: QPProblem) -> Array | None:
-        """The solver's answer if it is one: of the right length and finite."""
-        z = self.solver.solve(problem)
+        """The solver's answer if it is one: of the right length and finite. Whatever a solver raises is none."""
+        try:
+            z = self.solver.solve(problem)
+        except Exception as error:
+            log.warning("the QP solver failed: %s", error)
+            return None
         return z if z is not None and np.shape(z) == problem.g.shape and np.all(np.isfinite(z)) else None
 
     @staticmethod

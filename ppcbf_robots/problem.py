@@ -139,7 +139,9 @@ def load_robot(name: str) -> Robot:
     else:
         spec, urdf = RobotSpec(urdf=str(path)), path
     dirs = [(path.parent / d).resolve() for d in spec.package_dirs] + default_package_dirs(urdf)
-    model = RobotModel(urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload, spec.moving, spec.position)
+    model = RobotModel(
+        urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload, spec.moving, spec.position, spec.effort_rate
+    )
     model.warnings += [spec.note] if spec.note else []
     domain = derive_domain(model, spec.domain)
     model.check_mass_matrix(domain.sample_q(np.random.default_rng(SAMPLE_SEED), 100))

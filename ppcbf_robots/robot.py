@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits
+from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits, rate_limits
 from ppcbf_robots.kernels import mirror, points_at
 from ppcbf_robots.meshes import Meshes
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, vector
@@ -100,6 +100,7 @@ class RobotModel:
         effort: torque limits, overriding the URDF's [N m | N].
         velocity: velocity limits, overriding the URDF's [rad/s | m/s].
         position: position limits by joint, overriding the URDF's [rad | m].
+        effort_rate: how fast torques may change [N m/s | N/s]; joints without one are not limited.
         payload: a point mass added to a frame.
 
     Raises:
@@ -116,6 +117,7 @@ class RobotModel:
         payload: PayloadSpec | None = None,
         moving: Sequence[str] | None = None,
         position: Mapping[str, tuple[float, float]] | None = None,
+        effort_rate: PerJoint | None = None,
     ) -> None:
         self.urdf = Path(urdf)
         self.package_dirs = [Path(p) for p in package_dirs]
@@ -142,6 +144,7 @@ class RobotModel:
         self._index_joints()
         names = self.joint_names
         self.u_max, self.v_max = force_limits(self.urdf, names, facts.joints, effort, velocity)
+        self.u_rate = rate_limits(self.urdf, names, effort_rate)
         self.q_lower, self.q_upper = position_limits(self.urdf, names, facts.joints, position or {}, self.warnings)
 
     def with_model(self, model: pin.Model) -> RobotModel:

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from ppcbf_robots.barriers import Barrier, RhoBarrier
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, is_slow
+from ppcbf_robots.filters import Box, ClosedForm, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.shapes import Motion, Packed
 from ppcbf_robots.specs import Array
+from ppcbf_robots.state_check import StateCheck, is_finite_number
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,12 @@ class SafetyFilter:
         config: filter settings.
         damping: K_d (nv,) of the fallback torque ``sat(g - K_d v)``; by default 1 % of u_max per v_max.
         gravity_included: False if u_des leaves gravity out and the returned torque must too (libfranka).
+        rate: how fast the returned torque may change, one number or (nv,) [N m/s | N/s]; by default the robot's
+            ``u_rate``, infinite for none. One control period ``config.dt`` counts per step, however late it comes.
+
+    Where the rate is limited, every returned torque but STOP's zero lies within ``rate dt`` of the last one, and inside
+    the box. Before the first step and after :meth:`reset` the last one is taken to be the gravity torque (zero without
+    ``gravity_included``), that of an arm held at rest; give ``u_last`` if it is another.
 
     The filter keeps counts of every status in ``counts`` and logs each step down its ladder with the reason. Python is
     not a safety-rated function: keep the robot's own monitored limits on.
@@ -59,6 +66,7 @@ class SafetyFilter:
         config: FilterConfig | None = None,
         damping: Array | None = None,
         gravity_included: bool = True,
+        rate: ArrayLike | None = None,
     ) -> None:
         self.robot, self.safety, self.barrier = robot, safety, barrier
         self.config = config or FilterConfig()
@@ -70,14 +78,29 @@ class SafetyFilter:
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
         self._last_status = Status.FREE
-        self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
+        config = self.config
+        self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
+        self._last_g: Array | None = None  # gravity torque of the last valid state
         self._invalid_steps = 0  # in a row
+        self._step_limit = self._rate(rate) * config.dt
+        self._rate_limited = bool(np.isfinite(self._step_limit).any())
+        self._u_last: Array | None = None  # as returned
         if self.damping.shape != (robot.nv,) or not np.all(np.isfinite(self.damping) & (self.damping >= 0.0)):
             raise InputError(f"damping: expected {robot.nv} finite numbers of at least 0, got {self.damping.tolist()}")
 
     def reset(self) -> None:
-        """Forget the last state, for a clock that starts anew."""
-        self._last, self._invalid_steps = None, 0
+        """Forget the last state and torque, for a clock that starts anew or an arm that was moved by other means."""
+        self._check.reset()
+        self._last_g, self._invalid_steps, self._u_last = None, 0, None
+
+    def _rate(self, rate: ArrayLike | None) -> Array:
+        try:
+            rates = np.array(np.broadcast_to(self.robot.u_rate if rate is None else rate, (self.robot.nv,)), float)
+        except (TypeError, ValueError):
+            rates = np.zeros(self.robot.nv)
+        if not np.all(rates > 0.0):
+            raise InputError(f"rate: expected one positive number or {self.robot.nv}, got {rate!r}")
+        return rates
 
     def step(
         self,
@@ -87,6 +110,8 @@ class SafetyFilter:
         u_des: ArrayLike,
         d_p: float | None = None,
         motions: Mapping[str, Motion] | None = None,
+        u_last: ArrayLike | None = None,
+        age: float = 0.0,
     ) -> StepResult:
         """One control step.
 
@@ -100,40 +125,75 @@ class SafetyFilter:
             motions: obstacles, by name, that are elsewhere than in the world's file or moving. K_theta was not trained
                 for that: while any is given, the filter runs on the LB-CBF (K = 0). Where one comes closer, the
                 passivity row yields to it, and what that puts in is ``port_power``. An unknown name or NaN is a FAULT.
+            u_last: torque (nv,) in force until now, commanded or measured, in the convention of u_des; only a limited
+                rate looks at it. None: the torque that the last step returned. NaN is a FAULT.
+            age: how old the state is [s], if the caller knows; older than ``config.max_age`` it is invalid.
 
         Returns:
-            A finite torque, inside the box unless the filter is the closed form, and its status.
+            A finite torque and its status. It lies inside the box unless the filter is the closed form without a rate
+            limit, and keeps the rate.
         """
         q, v, u_des = (_numbers(x) for x in (q, v, u_des))
-        problem = self._invalid(t, q, v)
+        problem = self._check.problem(t, q, v, age)
+        unknown = "" if u_last is None else self._tell(u_last)
         if problem:
             self._invalid_steps += 1
             return self._count(self._hold(t, problem))
         dyn = self.robot.evaluate(q, v)
+        self._check.accept(t, dyn.q, dyn.v)
+        self._last_g, self._invalid_steps = dyn.g, 0
+        allowed = self._allowed(dyn.g)
         try:
             obstacles = self.safety.packed.moved(motions) if motions else None
         except InputError as error:
-            self._remember(t, dyn)
-            return self._count(self._fault(dyn, str(error)))
-        return self._count(self.filter(t, dyn, u_des, d_p, obstacles))
+            unknown = str(error)
+        if unknown:
+            return self._count(self._fault(dyn, unknown, allowed=allowed))
+        return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed))
+
+    def _tell(self, u_last: ArrayLike) -> str:
+        """Take over the caller's last torque; in words why not, if it cannot be used."""
+        u = _numbers(u_last)
+        if u.shape != (self.robot.nv,) or not np.isfinite(u).all():
+            return f"u_last is not {self.robot.nv} finite numbers"
+        self._u_last = u
+        return ""
+
+    def _allowed(self, g: Array) -> Box | None:
+        """Torques, gravity included, that box and rate allow after the last one; None if the rate is not limited.
+
+        The box comes first where a last torque outside it leaves no other.
+        """
+        if not self._rate_limited:
+            return None
+        u_max, offset = self.robot.u_max, 0.0 if self.gravity_included else g
+        last = np.clip(g, -u_max, u_max) if self._u_last is None else self._u_last + offset
+        return np.clip(last - self._step_limit, -u_max, u_max), np.clip(last + self._step_limit, -u_max, u_max)
 
     def filter(
-        self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None, obstacles: Packed | None = None
+        self,
+        dyn: Dynamics,
+        u_des: Array,
+        d_p: float | None,
+        obstacles: Packed | None = None,
+        allowed: Box | None = None,
     ) -> StepResult:
-        """The step for a state that was already evaluated (and checked), with the obstacles where they are now."""
-        self._remember(t, dyn)
+        """The step for a valid state on its own, with the obstacles where they are now.
+
+        ``allowed`` are the bounds of the torque, gravity included, where they are tighter than the box.
+        """
         safety = self.safety.evaluate(dyn, obstacles)
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
         wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
         if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
-            return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi)
+            return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi, allowed=allowed)
         pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
-        c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max)
+        c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max, allowed)
         if c.status is Status.FAULT:
-            return self._fault(dyn, c.reason, h, phi, self._name(c.row))
+            return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
         status = c.status
         if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
             status = Status.RESTING
@@ -141,13 +201,20 @@ class SafetyFilter:
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
 
-    def _remember(self, t: float, dyn: Dynamics) -> None:
-        """This state is valid: what an invalid one after it is bridged with."""
-        self._last, self._invalid_steps = (t, dyn.g), 0
+    def _fault(
+        self,
+        dyn: Dynamics,
+        reason: str,
+        h: float = np.nan,
+        phi: float = np.nan,
+        row: str = "",
+        allowed: Box | None = None,
+    ) -> StepResult:
+        """``sat(g - K_d v)`` for a valid state without a usable answer: kinetic energy cannot grow under it.
 
-    def _fault(self, dyn: Dynamics, reason: str, h: float = np.nan, phi: float = np.nan, row: str = "") -> StepResult:
-        """``sat(g - K_d v)`` for a valid state without a usable answer: kinetic energy cannot grow under it."""
-        u = np.clip(dyn.g - self.damping * dyn.v, -self.robot.u_max, self.robot.u_max)
+        With a limited rate it is approached at that rate, and may grow on the way.
+        """
+        u = np.clip(dyn.g - self.damping * dyn.v, *(allowed or (-self.robot.u_max, self.robot.u_max)))
         return StepResult(u if self.gravity_included else u - dyn.g, Status.FAULT, reason, h, phi, row)
 
     def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
@@ -157,36 +224,26 @@ class SafetyFilter:
     def _name(self, row: int) -> str:
         return self.safety.names[row] if row >= 0 else ""
 
-    def _invalid(self, t: float, q: Array, v: Array) -> str:
-        if q.shape != (self.robot.nq,) or v.shape != (self.robot.nv,):
-            return f"state of shape {q.shape}, {v.shape} instead of ({self.robot.nq},), ({self.robot.nv},)"
-        if not isinstance(t, int | float | np.number) or not np.isfinite(t):
-            return "time not a finite number"
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            return "state not finite"
-        c = self.robot.idx_q[self.robot.continuous]
-        if len(c) and np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):
-            return "a continuous joint's (cos, sin) is not of length 1"
-        if self._last is not None and t < self._last[0]:
-            return f"time went backwards, from {self._last[0]:g} s to {t:g} s"
-        return ""
-
     def _hold(self, t: float, problem: str) -> StepResult:
-        """Gravity torque of the last valid state for at most max_hold, then STOP with zero torque.
+        """Gravity torque of the last valid state for at most max_hold, approached at a limited rate; then STOP.
 
-        Time is the caller's clock or the count of steps, whichever is longer: the clock may be what failed.
+        STOP is zero torque at once. Time is the caller's clock or the count of steps, whichever is longer: the clock
+        may be what failed.
         """
         held = self._invalid_steps * self.config.dt
-        if self._last is not None and isinstance(t, int | float | np.number) and np.isfinite(t):
-            held = max(held, t - self._last[0])
-        if self._last is not None and held <= self.config.max_hold:
-            g = np.clip(self._last[1], -self.robot.u_max, self.robot.u_max)
-            u = g if self.gravity_included else np.zeros_like(g)
+        if self._check.last is not None and is_finite_number(t):
+            held = max(held, t - self._check.last[0])
+        if self._last_g is not None and held <= self.config.max_hold:
+            u = np.clip(self._last_g, -self.robot.u_max, self.robot.u_max)
+            u = u if self.gravity_included else np.zeros_like(u)
+            if self._u_last is not None and self._rate_limited:
+                u = np.clip(u, self._u_last - self._step_limit, self._u_last + self._step_limit)
             return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
         return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
 
     def _count(self, result: StepResult) -> StepResult:
         self.counts[result.status] += 1
+        self._u_last = result.u if self._rate_limited else None
         if result.status is not self._last_status:  # a change, not every tick of a lasting alarm
             level = logging.WARNING if result.status >= Status.PASSIVITY_DROPPED else logging.DEBUG
             log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)

@@ -27,6 +27,7 @@ LAYERS = [
     ["condense", "ending"],
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["filters"],
+    ["state_check"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],
     ["benchmark", "viability", "safe_sets", "nmpc"],
