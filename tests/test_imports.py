@@ -16,7 +16,7 @@ import pytest
 
 LAYERS = [
     ["errors"],
-    ["results_file"],
+    ["results_file", "certificate"],
     ["sweep"],
     ["specs", "resources", "kernels"],
     ["network_kernel", "dynamics_kernel"],
