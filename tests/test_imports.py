@@ -36,6 +36,7 @@ LAYERS = [
     ["learning"],
     ["export", "export_c", "plots", "plots_study", "viewer", "viewer_page", "viewer_shapes"],
     ["studies"],
+    ["report", "report_page", "report_parts"],
     ["cli"],
 ]
 """From the bottom up, some of them packages. A module imports from lower layers and its own."""
@@ -47,6 +48,7 @@ OWNERS = {
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
     "meshcat": ["viewer", "viewer_page", "viewer_shapes"],
+    "jinja2": ["report_page"],
     "matplotlib": ["plots", "plots_study", "studies.figures"],
     "mujoco": ["engine_mujoco"],
     "hj_reachability": ["viability"],
