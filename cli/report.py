@@ -22,7 +22,7 @@ def report(
     campaign: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Figures of `ppcbf campaign`: campaign.json or its folder.")
     ] = None,
-    duration: Annotated[float, typer.Option(min=0.1, max=600.0, help="Simulated seconds of the run shown.")] = 10.0,
+    duration: Annotated[float, typer.Option(min=0.1, max=600.0, help="Simulated seconds of the run shown.")] = 15.0,
     steps: Annotated[int, typer.Option(min=100, help="Filter steps that are timed.")] = 2000,
     robot: Annotated[str | None, typer.Option(help="Where the robot is now, if it was moved.")] = None,
     obstacles: Annotated[str | None, typer.Option(help="Where the world is now, if it was moved.")] = None,

@@ -15,7 +15,7 @@ from ppcbf_robots.benchmark import Case, measure
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.report_page import Badge, Tone, render_report
-from ppcbf_robots.report_parts import PARTS, VERDICTS, Material, percent
+from ppcbf_robots.report_parts import PARTS, VERDICTS, Material, percent, same_barrier
 from ppcbf_robots.resources import portable
 
 CAMPAIGN_KEYS = ("rollouts", "contacts", "limit_violations", "torque_violations", "rate_violations", "diverged")
@@ -104,8 +104,9 @@ def _badges(m: Material) -> list[Badge]:
         badges.append(Badge("Campaign", "none", "run ppcbf campaign", "none"))
     else:
         failed = len(m.campaign["failed"])
-        word = "clean" if failed == 0 else f"{failed} failed"
-        badges.append(Badge("Campaign", word, f"{m.campaign['rollouts']:,} runs", "bad" if failed else "good"))
+        word, runs = "clean" if failed == 0 else f"{failed} failed", f"{m.campaign['rollouts']:,} runs"
+        other = "" if same_barrier(m) else ", of another barrier"
+        badges.append(Badge("Campaign", word, runs + other, "bad" if failed else "warn" if other else "good"))
     facts = m.run.summary(m.problem.model)
     hit = facts["clearance"] < 0.0
     names = {"goal": "goal reached", "held": "rests", "stalled": "at rest", "moving": "still moving"}

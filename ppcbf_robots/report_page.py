@@ -47,7 +47,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report, in the order text, tables, figures, notes."""
+    """A part of the report, in the order text, tables, figures, notes with their heading."""
 
     name: str  # of its anchor
     title: str
@@ -55,6 +55,7 @@ class Section:
     tables: list[Table] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    noted: str = "Notes"
 
 
 def render_report(
@@ -96,6 +97,7 @@ header, main, footer { max-width: 1020px; margin: 0 auto; padding: 0 20px; }
 header { padding-top: 32px; }
 h1 { font-size: 30px; line-height: 1.2; margin: 0 0 4px; }
 h2 { font-size: 21px; margin: 0 0 10px; }
+h3 { font-size: 16px; margin: 14px 0 0; }
 .soft, figcaption, footer, caption { color: var(--soft); }
 nav ul { list-style: none; margin: 16px 0; padding: 0; display: flex; flex-wrap: wrap; gap: 4px 18px; }
 .skip { position: absolute; left: -999px; } .skip:focus { left: 20px; top: 8px; }
@@ -115,6 +117,7 @@ caption { text-align: left; font-size: 14px; padding-bottom: 4px; }
 th, td { text-align: left; vertical-align: top; padding: 5px 18px 5px 0; border-bottom: 1px solid var(--line); }
 thead th { color: var(--soft); font-weight: 600; }
 tbody th { font-weight: 500; }
+.many { min-width: 620px; }
 figure { margin: 16px 0; }
 figure img { width: 100%; height: auto; background: #fff; border: 1px solid var(--line); border-radius: 8px; }
 figcaption { font-size: 14px; }
@@ -149,7 +152,8 @@ footer { font-size: 14px; padding-bottom: 40px; }
 <p>{{ line }}</p>
 {% endfor %}
 {% for table in section.tables %}
-<div class="wide" tabindex="0" role="region" aria-label="{{ table.caption }}"><table>
+<div class="wide" tabindex="0" role="region" aria-label="{{ table.caption }}">
+<table{% if table.columns|length > 3 %} class="many"{% endif %}>
 <caption>{{ table.caption }}</caption>
 {% if table.columns %}
 <thead><tr>{% for column in table.columns %}<th scope="col">{{ column }}</th>{% endfor %}</tr></thead>
@@ -165,6 +169,7 @@ footer { font-size: 14px; padding-bottom: 40px; }
 <figcaption>{{ figure.caption }}</figcaption></figure>
 {% endfor %}
 {% if section.notes %}
+<h3>{{ section.noted }}</h3>
 <ul class="soft">{% for note in section.notes %}<li>{{ note }}</li>{% endfor %}</ul>
 {% endif %}
 </section>

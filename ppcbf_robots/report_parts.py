@@ -57,7 +57,14 @@ def _robot(m: Material) -> Section:
     columns = ["joint", "domain X [rad | m]", "speed limit", "torque limit", "rate limit", "K_p", "K_d"]
     spheres, controller = len(m.problem.robot.body), gains.kind.replace("_", " ")
     text = [f"{model.nv} moving joints; {spheres} body spheres; controller {controller}."]
-    return Section("robot", "Robot", text, [Table("Moving joints (SI units)", columns, rows)], notes=model.warnings)
+    return Section(
+        "robot",
+        "Robot",
+        text,
+        [Table("Moving joints (SI units)", columns, rows)],
+        notes=model.warnings,
+        noted="Warnings",
+    )
 
 
 def _world(m: Material) -> Section:
@@ -96,7 +103,7 @@ def _training(m: Material) -> Section:
             f"states that violate the torque condition {percent(last['torque'])}, the passivity condition "
             f"{percent(last['passivity'])}, volume kept {percent(last['volume_kept'])}."
         )
-        svg = _drawn(lambda path: plot_curves([history], path))
+        svg = _drawn(lambda path: plot_curves([history], path, columns=2))
         figures.append(Figure(svg, alt, "Training: loss, violated shares of the band and volume kept."))
     return Section("training", "Training", text, figures=figures)
 
@@ -125,8 +132,8 @@ def _certificate(m: Material) -> Section:
     rows = [[name, c.statement, c.verdict, _certainty(c.verdict, vars(c)), _number(c.worst_margin)]
             for name, c in found.conditions.items()]  # fmt: skip
     table = Table("Conditions", ["condition", "what it says", "verdict", "how certain", "least margin"], rows)
-    text = [VERDICTS[found.verdict][1], f"Found by {found.method} in {_seconds(found.seconds)}. Not covered:"]
-    return Section("certificate", "Certificate", text, [table], notes=found.not_covered)
+    text = [VERDICTS[found.verdict][1], f"Found by {found.method} in {_seconds(found.seconds)}."]
+    return Section("certificate", "Certificate", text, [table], notes=found.not_covered, noted="Not covered")
 
 
 def _certainty(verdict: str, c: Mapping[str, Any]) -> str:
@@ -174,7 +181,7 @@ def _campaign(m: Material) -> Section:
         f"{facts['engine'].capitalize()}, with the {facts['barrier_kind'].upper()} barrier"
         + (f"; {' and '.join(given)}." if given else ".")
     ]
-    if facts["barrier"] not in (str(m.folder.resolve()), str(m.folder)):
+    if not same_barrier(m):
         text.append(f"These runs used another barrier: {facts['barrier']}.")
     rows = [
         ["runs with a contact", str(facts["contacts"])],
@@ -192,6 +199,11 @@ def _campaign(m: Material) -> Section:
         ["still moving at the end", str(facts["moving"])],
     ]
     return Section("campaign", "Campaign", text, [Table("What was counted", [], rows)])
+
+
+def same_barrier(m: Material) -> bool:
+    """Whether the campaign ran with the barrier of the report, as far as its folder says."""
+    return m.campaign is not None and m.campaign["barrier"] == str(m.folder.resolve())
 
 
 def _latency(m: Material) -> Section:
