@@ -234,7 +234,7 @@ def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
         ["still moving", str(facts["moving"])],
         ["CPU time [s]", f"{facts['seconds']:.1f}"],
     ]  # fmt: skip
-    table(title, ["", ""], rows)
+    table(title, ["what", "figure"], rows)
     if facts["failed"]:
         shown = ", ".join(map(str, facts["failed"][:10])) + (", ..." if len(facts["failed"]) > 10 else "")
         out.print(f"failed: {shown}; the same command with --replay N --out T.npz writes one of them")
