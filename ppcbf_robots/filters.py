@@ -66,6 +66,7 @@ class FilterConfig:
     near_rows: int = 16  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
     max_age: float = 0.005  # [s], how old or how often repeated a state may be before it is invalid
+    slip_time: float = 0.01  # [s], over which the slip of phi is averaged that the QP makes up for; infinite for none
     dt: float = 1e-3  # [s], control period
 
     @property
@@ -81,6 +82,8 @@ class FilterConfig:
         for name in ("alpha", "dt", "max_hold", "max_age", "near_rows"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"filter {name}: must be a positive number, got {getattr(self, name)}")
+        if not self.slip_time > 0.0:
+            raise InputError(f"filter slip_time: must be a positive number, got {self.slip_time}")
         if not (np.isfinite(self.margin) and self.margin >= 0.0):
             raise InputError(f"filter margin: must be a number of at least 0, got {self.margin}")
 
@@ -201,6 +204,11 @@ def is_slow(robot: RobotModel, v: Array) -> bool:
     return bool((np.abs(v) <= NEAR_REST * robot.v_max).all())
 
 
+def slowest_joint(robot: RobotModel, rate: Array) -> float:
+    """Least ``rate / u_max`` of all joints [1/s], infinite where no rate is limited."""
+    return float(np.min(rate / robot.u_max))
+
+
 class QPFilter:
     """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
 
@@ -208,10 +216,22 @@ class QPFilter:
     ``vᵀ δ <= d_p``. The near rows are those closest to violation by u_des, each in units of the correction it needs;
     the others are checked afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
     solution, the velocity domain is given up first, then passivity; then the least violation is sought.
+
+    Under a limited rate no class-K gain is above the least ``rate / u_max`` of all joints: a row that comes into force
+    faster than a torque can be built up finds no solution, and what then follows throws the arm about.
+
+    Args:
+        barrier: gives the rows.
+        safety: what they are rows of.
+        config: settings.
+        rate: of the torques (nv,) [N m/s | N/s]; matters where ``correct`` is given bounds of the torque.
     """
 
-    def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
+    def __init__(
+        self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig, rate: Array | None = None
+    ) -> None:
         self.barrier, self.safety, self.config = barrier, safety, config
+        self.fastest = np.inf if rate is None else slowest_joint(safety.robot, rate)
         self.solver: QPSolver = make_solver(config.solver)
 
     def _condense(
@@ -219,6 +239,7 @@ class QPFilter:
     ) -> tuple[QPRows, int, bool]:
         energy = self.barrier.kind == "pp-cbf"
         alpha = self.barrier.spec.gamma_K if energy else self.config.alpha
+        fastest = np.inf if allowed is None else self.fastest
         count, nv = len(rows.phi) + 2 * len(self.safety.v_domain), len(u_max)
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
         binding = np.empty(count, dtype=np.bool_)
@@ -226,8 +247,8 @@ class QPFilter:
         box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
         hopeless, hold = condense(
             rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max, *box,
-            alpha, self.config.speed_alpha, 0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE,
-            C, lower, norm, binding,
+            min(alpha, fastest), min(self.config.speed_alpha, fastest), 0.0 if energy else self.config.margin,
+            _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
         )  # fmt: skip
         limits = "box" if allowed is None else "box and rate"
         return QPRows(C, lower, norm, binding, len(rows.phi), box, limits), hopeless, hold

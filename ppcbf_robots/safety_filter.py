@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ppcbf_robots.barriers import Barrier, RhoBarrier
+from ppcbf_robots.barriers import Barrier, BarrierRows, RhoBarrier
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import Box, ClosedForm, FilterConfig, QPFilter, Status, is_slow
+from ppcbf_robots.filters import Box, ClosedForm, Correction, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
-from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.shapes import Motion, Packed
+from ppcbf_robots.slip import SlipObserver
 from ppcbf_robots.specs import Array
 from ppcbf_robots.state_check import StateCheck, is_finite_number
 
@@ -73,7 +75,8 @@ class SafetyFilter:
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
         closed = self.config.kind == "closed-form"
-        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config)
+        limit = self._rate(rate)
+        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config, limit)
         learned = isinstance(barrier, RhoBarrier)
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
@@ -82,16 +85,22 @@ class SafetyFilter:
         self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
         self._last_g: Array | None = None  # gravity torque of the last valid state
         self._invalid_steps = 0  # in a row
-        self._step_limit = self._rate(rate) * config.dt
+        self._step_limit = limit * config.dt
         self._rate_limited = bool(np.isfinite(self._step_limit).any())
-        self._u_last: Array | None = None  # as returned
+        self._sent: deque[Array] = deque(maxlen=math.ceil(config.max_age / config.dt) + 1)  # torques as returned
+        watched = not closed and learned and math.isfinite(config.slip_time)
+        self._slip = SlipObserver(config.dt, config.slip_time) if watched else None
+        self._moved = False  # whether obstacles were elsewhere in the last step
         if self.damping.shape != (robot.nv,) or not np.all(np.isfinite(self.damping) & (self.damping >= 0.0)):
             raise InputError(f"damping: expected {robot.nv} finite numbers of at least 0, got {self.damping.tolist()}")
 
     def reset(self) -> None:
         """Forget the last state and torque, for a clock that starts anew or an arm that was moved by other means."""
         self._check.reset()
-        self._last_g, self._invalid_steps, self._u_last = None, 0, None
+        self._last_g, self._invalid_steps = None, 0
+        self._sent.clear()
+        if self._slip is not None:
+            self._slip.reset()
 
     def _rate(self, rate: ArrayLike | None) -> Array:
         try:
@@ -127,7 +136,8 @@ class SafetyFilter:
                 passivity row yields to it, and what that puts in is ``port_power``. An unknown name or NaN is a FAULT.
             u_last: torque (nv,) in force until now, commanded or measured, in the convention of u_des; only a limited
                 rate looks at it. None: the torque that the last step returned. NaN is a FAULT.
-            age: how old the state is [s], if the caller knows; older than ``config.max_age`` it is invalid.
+            age: how old the state is [s], if the caller knows; the filter predicts it to now with the torques returned
+                since. Older than ``config.max_age`` it is invalid.
 
         Returns:
             A finite torque and its status. It lies inside the box unless the filter is the closed form without a rate
@@ -139,8 +149,8 @@ class SafetyFilter:
         if problem:
             self._invalid_steps += 1
             return self._count(self._hold(t, problem))
-        dyn = self.robot.evaluate(q, v)
-        self._check.accept(t, dyn.q, dyn.v)
+        self._check.accept(t, q.copy(), v.copy())
+        dyn = self.robot.evaluate(*(self._predict(q, v, age) if age > 0.0 else (q, v)))
         self._last_g, self._invalid_steps = dyn.g, 0
         allowed = self._allowed(dyn.g)
         try:
@@ -149,14 +159,32 @@ class SafetyFilter:
             unknown = str(error)
         if unknown:
             return self._count(self._fault(dyn, unknown, allowed=allowed))
-        return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed))
+        return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed, t))
+
+    def _predict(self, q: Array, v: Array, age: float) -> tuple[Array, Array]:
+        """The state ``age`` [s] later under the torques returned since, before the first of them gravity's."""
+        dt = self.config.dt
+        periods, rest = divmod(age, dt)
+        pieces = [dt] * int(periods) + [rest]
+        q_now, v_now = q, v
+        for i, piece in enumerate(reversed(pieces)):
+            behind = len(pieces) - i  # periods ago
+            u = self._sent[-behind] if behind <= len(self._sent) else None
+            if u is None or not self.gravity_included:
+                u = self.robot.gravity(q_now) + (0.0 if u is None else u)
+            v_now = v_now + piece * self.robot.acceleration(q_now, v_now, u)
+            q_now = self.robot.integrate(q_now, piece * v_now)
+        usable = bool(np.isfinite(q_now).all() and np.isfinite(v_now).all())
+        return (q_now, v_now) if usable else (q, v)
 
     def _tell(self, u_last: ArrayLike) -> str:
         """Take over the caller's last torque; in words why not, if it cannot be used."""
         u = _numbers(u_last)
         if u.shape != (self.robot.nv,) or not np.isfinite(u).all():
             return f"u_last is not {self.robot.nv} finite numbers"
-        self._u_last = u
+        if self._sent:
+            self._sent.pop()
+        self._sent.append(u)
         return ""
 
     def _allowed(self, g: Array) -> Box | None:
@@ -167,7 +195,7 @@ class SafetyFilter:
         if not self._rate_limited:
             return None
         u_max, offset = self.robot.u_max, 0.0 if self.gravity_included else g
-        last = np.clip(g, -u_max, u_max) if self._u_last is None else self._u_last + offset
+        last = self._sent[-1] + offset if self._sent else np.clip(g, -u_max, u_max)
         return np.clip(last - self._step_limit, -u_max, u_max), np.clip(last + self._step_limit, -u_max, u_max)
 
     def filter(
@@ -177,12 +205,17 @@ class SafetyFilter:
         d_p: float | None,
         obstacles: Packed | None = None,
         allowed: Box | None = None,
+        t: float | None = None,
     ) -> StepResult:
-        """The step for a valid state on its own, with the obstacles where they are now.
+        """The step for a valid state, with the obstacles where they are now.
 
-        ``allowed`` are the bounds of the torque, gravity included, where they are tighter than the box.
+        ``allowed`` are the bounds of the torque, gravity included, where they are tighter than the box. Without ``t``
+        the state stands on its own: nothing is learned from it of the slip of phi.
         """
         safety = self.safety.evaluate(dyn, obstacles)
+        if self._slip is not None and t is not None and self._moved != (obstacles is not None):
+            self._moved = obstacles is not None
+            self._slip.forget_step()  # another barrier
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
@@ -191,7 +224,9 @@ class SafetyFilter:
             return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi, allowed=allowed)
         pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
-        c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max, allowed)
+        c = self._correct(
+            dyn, safety, rows, u_des + offset, budget, allowed, None if t is None else self._slip, t or 0.0
+        )
         if c.status is Status.FAULT:
             return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
         status = c.status
@@ -200,6 +235,22 @@ class SafetyFilter:
         u = c.u - offset
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
+
+    def _correct(
+        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None,
+        allowed: Box | None, slip: SlipObserver | None, t: float,
+    ) -> Correction:  # fmt: skip
+        """The correction that makes up for the slip of phi, or where that is too much to ask, the one that does not."""
+        u_max = self.robot.u_max
+        if slip is None:
+            return self.correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
+        c = self.correction.correct(dyn, safety, slip.wary(t, rows), u_des, d_p, u_max, allowed)
+        if c.status >= Status.PASSIVITY_DROPPED:
+            plain = self.correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
+            c = plain if plain.status < c.status else c
+        if c.status is not Status.FAULT:
+            slip.applied(t, rows, c.u)
+        return c
 
     def _fault(
         self,
@@ -236,14 +287,14 @@ class SafetyFilter:
         if self._last_g is not None and held <= self.config.max_hold:
             u = np.clip(self._last_g, -self.robot.u_max, self.robot.u_max)
             u = u if self.gravity_included else np.zeros_like(u)
-            if self._u_last is not None and self._rate_limited:
-                u = np.clip(u, self._u_last - self._step_limit, self._u_last + self._step_limit)
+            if self._sent:
+                u = np.clip(u, self._sent[-1] - self._step_limit, self._sent[-1] + self._step_limit)
             return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
         return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
 
     def _count(self, result: StepResult) -> StepResult:
         self.counts[result.status] += 1
-        self._u_last = result.u if self._rate_limited else None
+        self._sent.append(result.u)
         if result.status is not self._last_status:  # a change, not every tick of a lasting alarm
             level = logging.WARNING if result.status >= Status.PASSIVITY_DROPPED else logging.DEBUG
             log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)
