@@ -38,6 +38,7 @@ ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is chec
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
 SPEED_SHARE = 0.3  # of the way to the bound of the velocity domain that one control period may go
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
+GAMMA_PER_RATE = 2.0  # times the least rate / u_max: with more, rows were infeasible in trials
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
 
@@ -207,6 +208,14 @@ def is_slow(robot: RobotModel, v: Array) -> bool:
 def slowest_joint(robot: RobotModel, rate: Array) -> float:
     """Least ``rate / u_max`` of all joints [1/s], infinite where no rate is limited."""
     return float(np.min(rate / robot.u_max))
+
+
+def too_fast_for_rate(robot: RobotModel, gamma: float) -> str:
+    """A warning if the barrier brakes faster than torques can be built up, empty otherwise."""
+    most = GAMMA_PER_RATE * slowest_joint(robot, robot.u_rate)
+    if gamma <= most:
+        return ""
+    return f"gamma {gamma:g} is too fast for effort_rate, rows will often be infeasible: give at most {most:.2g}"
 
 
 class QPFilter:
