@@ -23,6 +23,10 @@ from ppcbf_robots.rollout import simulate as rollout
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array, vector
 
+EffortRateOption = Annotated[
+    float | None, typer.Option(help="How fast torques may change [N m/s]; else the robot spec's `effort_rate`.")
+]
+
 
 def simulate(
     robot: RobotArgument,
@@ -42,6 +46,7 @@ def simulate(
     goal: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
     duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="Simulated seconds.")] = 10.0,
     rate: Annotated[float, typer.Option(min=10.0, max=2000.0, help="Control rate [Hz].")] = 1000.0,
+    effort_rate: EffortRateOption = None,
     engine: Annotated[
         EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")
     ] = "pinocchio",
@@ -52,7 +57,7 @@ def simulate(
 
     Example: ppcbf simulate panda sphere --barrier runs/panda --duration 5 --out runs/panda.npz
     """
-    problem = load_problem(robot, obstacles)
+    problem = limit_rate(load_problem(robot, obstacles), effort_rate)
     model = problem.model
     q = _angles(problem, start, "--start", problem.robot.start)
     given = parse_vector(velocity, "--velocity")
@@ -77,6 +82,15 @@ def simulate(
         )
     if not trajectory.meta["complete"]:
         raise CheckFailed(f"the simulation diverged at {trajectory.t[-1]:.3f} s; {out_file} holds what there is")
+
+
+def limit_rate(problem: Problem, effort_rate: float | None) -> Problem:
+    """The problem just loaded with another limit of how fast every torque may change [N m/s | N/s]."""
+    if effort_rate is not None:
+        if not effort_rate > 0.0:
+            raise InputError(f"--effort-rate: must be a positive number, got {effort_rate:g}")
+        problem.model.u_rate = np.full(problem.model.nv, effort_rate)
+    return problem
 
 
 def outside_domain(problem: Problem, trajectory: Trajectory) -> float:
@@ -171,6 +185,9 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
     )
     out.print(f"least h            {facts['min_h']:.4f}  (obstacles alone {facts['clearance']:.4f} m)")
     out.print(f"largest torque     {facts['max_torque_ratio']:.3f} of its limit")
+    if facts["rate_violations"] is not None:
+        over = f", over it in {facts['rate_violations']} steps" if facts["rate_violations"] else ""
+        out.print(f"fastest torque     {facts['max_rate_ratio']:.3f} of its rate limit{over}")
     out.print(
         f"energy             rises by {facts['energy_rise']:.2g} of V0, {facts['injected']:.3g} J injected in all"
     )

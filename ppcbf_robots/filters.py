@@ -38,6 +38,7 @@ ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is chec
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
 SPEED_SHARE = 0.3  # of the way to the bound of the velocity domain that one control period may go
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
+GAMMA_PER_RATE = 2.0  # times the least rate / u_max: with more, rows were infeasible in trials
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
 
@@ -66,6 +67,7 @@ class FilterConfig:
     near_rows: int = 16  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
     max_age: float = 0.005  # [s], how old or how often repeated a state may be before it is invalid
+    slip_time: float = 0.01  # [s], over which the slip of phi is averaged that the QP makes up for; infinite for none
     dt: float = 1e-3  # [s], control period
 
     @property
@@ -81,6 +83,8 @@ class FilterConfig:
         for name in ("alpha", "dt", "max_hold", "max_age", "near_rows"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"filter {name}: must be a positive number, got {getattr(self, name)}")
+        if not self.slip_time > 0.0:
+            raise InputError(f"filter slip_time: must be a positive number, got {self.slip_time}")
         if not (np.isfinite(self.margin) and self.margin >= 0.0):
             raise InputError(f"filter margin: must be a number of at least 0, got {self.margin}")
 
@@ -205,6 +209,19 @@ def is_slow(robot: RobotModel, v: Array) -> bool:
     return bool((np.abs(v) <= NEAR_REST * robot.v_max).all())
 
 
+def slowest_joint(robot: RobotModel, rate: Array) -> float:
+    """Least ``rate / u_max`` of all joints [1/s], infinite where no rate is limited."""
+    return float(np.min(rate / robot.u_max))
+
+
+def too_fast_for_rate(robot: RobotModel, gamma: float) -> str:
+    """A warning if the barrier brakes faster than torques can be built up, empty otherwise."""
+    most = GAMMA_PER_RATE * slowest_joint(robot, robot.u_rate)
+    if gamma <= most:
+        return ""
+    return f"gamma {gamma:g} is too fast for effort_rate, rows will often be infeasible: give at most {most:.2g}"
+
+
 class QPFilter:
     """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
 
@@ -212,24 +229,36 @@ class QPFilter:
     ``vᵀ δ <= d_p``. The near rows are those closest to violation by u_des, each in units of the correction it needs;
     the others are checked afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
     solution, the velocity domain is given up first, then passivity; then the least violation is sought.
+
+    Under a limited rate no class-K gain is above the least ``rate / u_max`` of all joints: a row that comes into force
+    faster than a torque can be built up finds no solution, and what then follows throws the arm about.
+
+    Args:
+        barrier: gives the rows.
+        safety: what they are rows of.
+        config: settings.
+        rate: of the torques (nv,) [N m/s | N/s]; matters where ``correct`` is given bounds of the torque.
     """
 
-    def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
+    def __init__(
+        self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig, rate: Array | None = None
+    ) -> None:
         self.barrier, self.safety, self.config = barrier, safety, config
+        self.fastest = np.inf if rate is None else slowest_joint(safety.robot, rate)
         self.solver: QPSolver = make_solver(config.solver)
 
-    def _class_k(self) -> tuple[float, float, float]:
+    def _class_k(self, limited: bool) -> tuple[float, float, float]:
         """Class-K gain of the barrier's rows and of the velocity domain [1/s], and the margin kept off phi."""
-        if self.barrier.kind == "pp-cbf":
-            return self.barrier.spec.gamma_K, self.config.speed_alpha, 0.0
-        return self.config.alpha, self.config.speed_alpha, self.config.margin
+        energy, fastest = self.barrier.kind == "pp-cbf", self.fastest if limited else np.inf
+        alpha = self.barrier.spec.gamma_K if energy else self.config.alpha
+        return min(alpha, fastest), min(self.config.speed_alpha, fastest), 0.0 if energy else self.config.margin
 
     def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
         """Whether :meth:`correct` leaves u_des (B, nv) as it is, (B,), for a batch of states and no limited rate."""
         hold = np.empty(len(u_des), dtype=np.bool_)
         hold_at(
             rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            *self._class_k(), _FLAT, ROW_TOLERANCE, hold,
+            *self._class_k(False), _FLAT, ROW_TOLERANCE, hold,
         )  # fmt: skip
         return hold
 
@@ -243,8 +272,7 @@ class QPFilter:
         box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
         hopeless, hold = condense(
             rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max, *box,
-            *self._class_k(), _FLAT, ROW_TOLERANCE,
-            C, lower, norm, binding,
+            *self._class_k(allowed is not None), _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
         )  # fmt: skip
         limits = "box" if allowed is None else "box and rate"
         return QPRows(C, lower, norm, binding, len(rows.phi), box, limits), hopeless, hold

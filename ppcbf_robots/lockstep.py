@@ -14,7 +14,7 @@ import numpy as np
 
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.batch_dynamics import BatchDynamics
-from ppcbf_robots.filters import FilterConfig
+from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.pushes import Push, push_torques
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -56,6 +56,7 @@ def simulate_together(
     """
     model, kd = problem.model, problem.robot.controller.gains.kd
     filters = [SafetyFilter(model, problem.safety, barrier, config, kd) for _ in cases] if barrier else []
+    slips = filters[0].slips(len(cases)) if filters else None
     substeps = max(1, round(config.dt / RK4_STEP))
     dt = substeps * RK4_STEP
     t = dt * np.arange(max(1, round(duration / dt)) + 1, dtype=float)
@@ -72,11 +73,13 @@ def simulate_together(
         wanted = problem.robot.controller.evaluate(dyn, goals)
         u, status = wanted.u.copy(), np.zeros(len(cases), dtype=np.int64)
         if filters:
-            screen = filters[0].screen(dyn, wanted.u)
+            screen = filters[0].screen(dyn, wanted.u, float(now), slips)
             h, phi = screen.safety.h, screen.rows.phi.min(axis=1)
             for i in map(int, np.flatnonzero(~screen.free & ~over)):
                 result = filters[i].step_screened(_state(dyn, i), screen, i, wanted.u[i], float(wanted.d_p[i]))
                 u[i], status[i], row[i] = result.u, result.status, result.row
+            if slips is not None:
+                slips.applied(float(now), screen.rows, u, status != Status.FAULT)
         else:
             h, phi = problem.safety.evaluate(dyn).h, np.full(len(cases), np.nan)
         clearance = h[:, : problem.safety.pairs].min(axis=1)

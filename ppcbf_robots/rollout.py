@@ -81,10 +81,13 @@ class Trajectory:
         error = float(np.max(np.abs(model.difference(self.q[-1], goal))))
         end = self.ending()
         contacts = self.meta.get("contacts")  # absent in files of version 0.1.0
+        rates = self._rate_ratios(model)
         return {
             "min_h": float(self.h.min()),
             "clearance": float(self.clearance.min()),
             "max_torque_ratio": float(np.max(np.abs(self.u) / model.u_max)),
+            "max_rate_ratio": None if rates is None else float(rates.max(initial=0.0)),
+            "rate_violations": None if rates is None else int(np.sum(rates > 1.0 + 1e-9)),
             "energy_rise": rise / V0,
             "injected": float(np.maximum(np.diff(self.V), 0.0).sum()),
             "reached_goal": error < GOAL_TOLERANCE,
@@ -99,6 +102,14 @@ class Trajectory:
             else [f"{c['link']} / {c['obstacle']}" for c in contacts["pairs"] if not c.get("hull_only", False)],
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
+
+    def _rate_ratios(self, model: RobotModel) -> Array | None:
+        """Largest ``|u̇_i| / u_rate_i`` of every step but those to and from a STOP (T - 1,); None without rate limits."""
+        if not np.any(np.isfinite(model.u_rate)):
+            return None
+        ratios = np.max(np.abs(np.diff(self.u, axis=0)) / (np.diff(self.t)[:, None] * model.u_rate), axis=1)
+        stopped = self.status == Status.STOP
+        return np.asarray(np.where(stopped[1:] | stopped[:-1], 0.0, ratios))
 
     def ending(self) -> Ending | None:
         """How the run ended; None if it diverged, or in files of version 0.2.0."""

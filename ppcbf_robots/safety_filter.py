@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,10 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows, RhoBarrier
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import Box, ClosedForm, FilterConfig, QPFilter, Status, is_slow
+from ppcbf_robots.filters import Box, ClosedForm, Correction, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.shapes import Motion, Packed
+from ppcbf_robots.slip import SlipBatch, SlipObserver
 from ppcbf_robots.specs import Array
 from ppcbf_robots.state_check import StateCheck, is_finite_number
 
@@ -44,12 +46,12 @@ class Screen:
     free: NDArray[np.bool_]  # (B,) u_des needs no correction
     safety: SafetyRows
     rows: BarrierRows
+    wary: BarrierRows  # lowered by the slip of phi, or the same rows
 
-    def at(self, i: int) -> tuple[SafetyRows, BarrierRows]:
+    def at(self, i: int) -> tuple[SafetyRows, BarrierRows, BarrierRows]:
         """The rows of one state."""
-        return SafetyRows(*(x[i] for x in vars(self.safety).values())), BarrierRows(
-            *(x[i] for x in vars(self.rows).values())
-        )
+        rows, wary = (BarrierRows(*(x[i] for x in vars(r).values())) for r in (self.rows, self.wary))
+        return SafetyRows(*(x[i] for x in vars(self.safety).values())), rows, rows if self.wary is self.rows else wary
 
 
 class SafetyFilter:
@@ -88,7 +90,8 @@ class SafetyFilter:
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
         closed = self.config.kind == "closed-form"
-        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config)
+        limit = self._rate(rate)
+        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config, limit)
         learned = isinstance(barrier, RhoBarrier)
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
@@ -97,16 +100,22 @@ class SafetyFilter:
         self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
         self._last_g: Array | None = None  # gravity torque of the last valid state
         self._invalid_steps = 0  # in a row
-        self._step_limit = self._rate(rate) * config.dt
+        self._step_limit = limit * config.dt
         self._rate_limited = bool(np.isfinite(self._step_limit).any())
-        self._u_last: Array | None = None  # as returned
+        self._sent: deque[Array] = deque(maxlen=math.ceil(config.max_age / config.dt) + 1)  # torques as returned
+        watched = not closed and learned and math.isfinite(config.slip_time)
+        self._slip = SlipObserver(config.dt, config.slip_time) if watched else None
+        self._moved = False  # whether obstacles were elsewhere in the last step
         if self.damping.shape != (robot.nv,) or not np.all(np.isfinite(self.damping) & (self.damping >= 0.0)):
             raise InputError(f"damping: expected {robot.nv} finite numbers of at least 0, got {self.damping.tolist()}")
 
     def reset(self) -> None:
         """Forget the last state and torque, for a clock that starts anew or an arm that was moved by other means."""
         self._check.reset()
-        self._last_g, self._invalid_steps, self._u_last = None, 0, None
+        self._last_g, self._invalid_steps = None, 0
+        self._sent.clear()
+        if self._slip is not None:
+            self._slip.reset()
 
     def _rate(self, rate: ArrayLike | None) -> Array:
         try:
@@ -142,7 +151,8 @@ class SafetyFilter:
                 passivity row yields to it, and what that puts in is ``port_power``. An unknown name or NaN is a FAULT.
             u_last: torque (nv,) in force until now, commanded or measured, in the convention of u_des; only a limited
                 rate looks at it. None: the torque that the last step returned. NaN is a FAULT.
-            age: how old the state is [s], if the caller knows; older than ``config.max_age`` it is invalid.
+            age: how old the state is [s], if the caller knows; the filter predicts it to now with the torques returned
+                since. Older than ``config.max_age`` it is invalid.
 
         Returns:
             A finite torque and its status. It lies inside the box unless the filter is the closed form without a rate
@@ -154,8 +164,8 @@ class SafetyFilter:
         if problem:
             self._invalid_steps += 1
             return self._count(self._hold(t, problem))
-        dyn = self.robot.evaluate(q, v)
-        self._check.accept(t, dyn.q, dyn.v)
+        self._check.accept(t, q.copy(), v.copy())
+        dyn = self.robot.evaluate(*(self._predict(q, v, age) if age > 0.0 else (q, v)))
         self._last_g, self._invalid_steps = dyn.g, 0
         allowed = self._allowed(dyn.g)
         try:
@@ -164,14 +174,32 @@ class SafetyFilter:
             unknown = str(error)
         if unknown:
             return self._count(self._fault(dyn, unknown, allowed=allowed))
-        return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed))
+        return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed, t))
+
+    def _predict(self, q: Array, v: Array, age: float) -> tuple[Array, Array]:
+        """The state ``age`` [s] later under the torques returned since, before the first of them gravity's."""
+        dt = self.config.dt
+        periods, rest = divmod(age, dt)
+        pieces = [dt] * int(periods) + [rest]
+        q_now, v_now = q, v
+        for i, piece in enumerate(reversed(pieces)):
+            behind = len(pieces) - i  # periods ago
+            u = self._sent[-behind] if behind <= len(self._sent) else None
+            if u is None or not self.gravity_included:
+                u = self.robot.gravity(q_now) + (0.0 if u is None else u)
+            v_now = v_now + piece * self.robot.acceleration(q_now, v_now, u)
+            q_now = self.robot.integrate(q_now, piece * v_now)
+        usable = bool(np.isfinite(q_now).all() and np.isfinite(v_now).all())
+        return (q_now, v_now) if usable else (q, v)
 
     def _tell(self, u_last: ArrayLike) -> str:
         """Take over the caller's last torque; in words why not, if it cannot be used."""
         u = _numbers(u_last)
         if u.shape != (self.robot.nv,) or not np.isfinite(u).all():
             return f"u_last is not {self.robot.nv} finite numbers"
-        self._u_last = u
+        if self._sent:
+            self._sent.pop()
+        self._sent.append(u)
         return ""
 
     def _allowed(self, g: Array) -> Box | None:
@@ -182,7 +210,7 @@ class SafetyFilter:
         if not self._rate_limited:
             return None
         u_max, offset = self.robot.u_max, 0.0 if self.gravity_included else g
-        last = np.clip(g, -u_max, u_max) if self._u_last is None else self._u_last + offset
+        last = self._sent[-1] + offset if self._sent else np.clip(g, -u_max, u_max)
         return np.clip(last - self._step_limit, -u_max, u_max), np.clip(last + self._step_limit, -u_max, u_max)
 
     def filter(
@@ -192,34 +220,54 @@ class SafetyFilter:
         d_p: float | None,
         obstacles: Packed | None = None,
         allowed: Box | None = None,
+        t: float | None = None,
     ) -> StepResult:
-        """The step for a valid state on its own, with the obstacles where they are now.
+        """The step for a valid state, with the obstacles where they are now.
 
-        ``allowed`` are the bounds of the torque, gravity included, where they are tighter than the box.
+        ``allowed`` are the bounds of the torque, gravity included, where they are tighter than the box. Without ``t``
+        the state stands on its own: nothing is learned from it of the slip of phi.
         """
         safety = self.safety.evaluate(dyn, obstacles)
+        if self._slip is not None and t is not None and self._moved != (obstacles is not None):
+            self._moved = obstacles is not None
+            self._slip.forget_step()  # another barrier
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
-        return self._filter_rows(dyn, safety, rows, u_des, d_p, obstacles is not None, allowed)
+        if not self._usable(rows, u_des, d_p):
+            reason, h, phi = "u_des, d_p or the barrier is not finite", float(rows.h.min()), float(rows.phi.min())
+            return self._fault(dyn, reason, h, phi, allowed=allowed)
+        if self._slip is None or t is None:
+            return self._answer(dyn, safety, rows, rows, u_des, d_p, obstacles is not None, allowed)
+        wary = self._slip.wary(t, rows)
+        result = self._answer(dyn, safety, rows, wary, u_des, d_p, obstacles is not None, allowed)
+        if result.status is not Status.FAULT:
+            self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g)
+        return result
 
-    def _filter_rows(
+    def _usable(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> bool:
+        wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
+        return wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())
+
+    def _answer(
         self,
         dyn: Dynamics,
         safety: SafetyRows,
         rows: BarrierRows,
+        wary: BarrierRows,
         u_des: Array,
         d_p: float | None,
         moving: bool,
         allowed: Box | None,
     ) -> StepResult:
-        """The step with all rows known; ``moving`` if they are of obstacles that are not where the file has them."""
+        """The step for finite rows.
+
+        ``wary`` are the same rows lowered by the slip of phi; ``moving`` says that they are of obstacles which are not
+        where the file has them.
+        """
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
-        wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
-        if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
-            return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi, allowed=allowed)
         pushed = moving and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
-        c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max, allowed)
+        c = self._correct(dyn, safety, rows, wary, u_des + offset, budget, allowed)
         if c.status is Status.FAULT:
             return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
         status = c.status
@@ -229,20 +277,42 @@ class SafetyFilter:
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
 
-    def screen(self, dyn: Dynamics, u_des: Array) -> Screen:
-        """The rows of a batch of valid states, and at which of them the filter leaves u_des (B, nv) as it is.
+    def _correct(
+        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, wary: BarrierRows, u_des: Array, d_p: float | None,
+        allowed: Box | None,
+    ) -> Correction:  # fmt: skip
+        """The correction that makes up for the slip of phi, or where that is too much to ask, the one that does not."""
+        u_max = self.robot.u_max
+        c = self.correction.correct(dyn, safety, wary, u_des, d_p, u_max, allowed)
+        if wary is not rows and c.status >= Status.PASSIVITY_DROPPED:
+            plain = self.correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
+            c = plain if plain.status < c.status else c
+        return c
+
+    def slips(self, count: int) -> SlipBatch | None:
+        """What is learned of the slip of phi in so many runs, for :meth:`screen`; None if this filter does not look."""
+        return None if self._slip is None else SlipBatch(self._slip.dt, self._slip.time, count)
+
+    def screen(self, dyn: Dynamics, u_des: Array, t: float = 0.0, slips: SlipBatch | None = None) -> Screen:
+        """The rows of a batch of valid states at time t, and at which of them the filter leaves u_des (B, nv) as it is.
 
         At the others, and at all where the rate is limited, :meth:`step_screened` has to be asked.
         """
         safety = self.safety.evaluate(dyn)
         rows = self.barrier.rows(dyn, safety)
+        wary = rows if slips is None else slips.wary(t, rows)
         total = u_des if self.gravity_included else u_des + dyn.g
-        free = self.correction.passes(dyn, rows, total, self.robot.u_max) & (not self._rate_limited)
-        return Screen(free, safety, rows)
+        free = self.correction.passes(dyn, wary, total, self.robot.u_max) & (not self._rate_limited)
+        return Screen(free, safety, rows, wary)
 
     def step_screened(self, dyn: Dynamics, screen: Screen, i: int, u_des: Array, d_p: float | None) -> StepResult:
         """The step for a valid state ``dyn``, number i of a screened batch, after the last one that this filter saw."""
-        return self._count(self._filter_rows(dyn, *screen.at(i), u_des, d_p, False, self._allowed(dyn.g)))
+        safety, rows, wary = screen.at(i)
+        allowed = self._allowed(dyn.g)
+        if not self._usable(rows, u_des, d_p):
+            reason = "u_des, d_p or the barrier is not finite"
+            return self._count(self._fault(dyn, reason, float(rows.h.min()), float(rows.phi.min()), allowed=allowed))
+        return self._count(self._answer(dyn, safety, rows, wary, u_des, d_p, False, allowed))
 
     def _fault(
         self,
@@ -279,14 +349,14 @@ class SafetyFilter:
         if self._last_g is not None and held <= self.config.max_hold:
             u = np.clip(self._last_g, -self.robot.u_max, self.robot.u_max)
             u = u if self.gravity_included else np.zeros_like(u)
-            if self._u_last is not None and self._rate_limited:
-                u = np.clip(u, self._u_last - self._step_limit, self._u_last + self._step_limit)
+            if self._sent:
+                u = np.clip(u, self._sent[-1] - self._step_limit, self._sent[-1] + self._step_limit)
             return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
         return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
 
     def _count(self, result: StepResult) -> StepResult:
         self.counts[result.status] += 1
-        self._u_last = result.u if self._rate_limited else None
+        self._sent.append(result.u)
         if result.status is not self._last_status:  # a change, not every tick of a lasting alarm
             level = logging.WARNING if result.status >= Status.PASSIVITY_DROPPED else logging.DEBUG
             log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)

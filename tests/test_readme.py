@@ -61,7 +61,9 @@ def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pyt
         monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(name_of(arguments), [])])
         with pytest.raises(SystemExit) as exit_info:
             main()
-        allowed = {0, 3} if arguments[0] in ("train", "compare", "sweep", "campaign") else {0}  # reduced training may not converge
+        allowed = (
+            {0, 3} if arguments[0] in ("train", "compare", "sweep", "campaign") else {0}
+        )  # reduced training may not converge
         assert exit_info.value.code in allowed, arguments
         for option in ("--out", "--html"):
             if option in arguments:
