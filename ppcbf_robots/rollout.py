@@ -104,7 +104,7 @@ class Trajectory:
         }
 
     def _rate_ratios(self, model: RobotModel) -> Array | None:
-        """Largest ``|u̇_i| / u_rate_i`` of every step but those to and from a STOP (T - 1,); None without rate limits."""
+        """Largest ``|u̇_i| / u_rate_i`` of each step (T - 1,), 0 to and from a STOP; None without rate limits."""
         if not np.any(np.isfinite(model.u_rate)):
             return None
         ratios = np.max(np.abs(np.diff(self.u, axis=0)) / (np.diff(self.t)[:, None] * model.u_rate), axis=1)
