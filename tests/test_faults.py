@@ -24,8 +24,8 @@ WORST = {
     "time backwards": "INVALID", "time NaN": "INVALID", "too old": "INVALID", "delay 1 ms": "CORRECTING",
     "u_des NaN": "FAULT", "d_p NaN": "FAULT", "payload": "CORRECTING", "all by chance": "CORRECTING",
     "obstacle touches": "INFEASIBLE", "obstacle NaN": "FAULT", "obstacle unknown": "FAULT", "solver stalled": "FAULT",
-    "solver raises": "FAULT", "solver NaN": "FAULT", "solver false": "INFEASIBLE", "L_g phi = 0": "INFEASIBLE",
-    "network NaN": "FAULT",
+    "solver raises": "FAULT", "solver NaN": "FAULT", "solver false": "FAULT", "solver wild": "FAULT",
+    "L_g phi = 0": "INFEASIBLE", "network NaN": "FAULT",
 }  # fmt: skip
 
 
