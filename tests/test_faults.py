@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import sys
 
 import numpy as np
@@ -48,6 +49,17 @@ def test_every_fault_is_survived_on_its_level_of_the_ladder(tmp_path):
         if np.isfinite(next(f.lasts for f in CASES if f.name == name)):
             assert case["back"] and case["back_ms"] is not None, name
     assert sum(case["worst"] == "REFUSED" for case in cases.values()) == len(artefact_faults.CASES) + 1
+
+
+def test_alarms_are_seen_where_logging_is_off(cartpole):
+    """As after `ppcbf bench` in the same process, and left as it was."""
+    barrier, config = cartpole.barrier("lb-cbf"), FilterConfig()
+    logging.disable(logging.CRITICAL)
+    try:
+        assert inject(cartpole, barrier, config, CASES[1], 100).logged is True
+        assert logging.root.manager.disable == logging.CRITICAL
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def test_the_table_says_what_is_broken_and_exits_with_3(monkeypatch, capsys):
