@@ -133,6 +133,15 @@ def verify(C: Any, lower: Any, binding: Any, z: Any, tolerance: float, missed: A
 
 
 @kernel
+def inside(z: Any, low: Any, high: Any, tolerance: float) -> bool:
+    """Whether every entry of z (n,) is finite and within its bounds."""
+    found = True
+    for i in range(len(z)):
+        found = found and low[i] - tolerance <= z[i] <= high[i] + tolerance
+    return found
+
+
+@kernel
 def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
     """``W`` in the dimensionless correction, M⁻¹ or 1 scaled by u_max on both sides, with mean diagonal 1."""
     n = len(u_max)

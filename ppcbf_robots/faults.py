@@ -213,6 +213,8 @@ def inject(problem: Problem, barrier: Barrier, config: FilterConfig, fault: Faul
     lasts = fault.lasts / config.dt
     log.addHandler(said)
     propagate, log.propagate = log.propagate, False  # alarms are expected here
+    silenced = log.manager.disable
+    logging.disable(logging.NOTSET)
     gc.disable()  # Python's collector stops a large program for 50 ms, whatever it was doing
     try:
         for i in range(first + round(AFTER / config.dt)):
@@ -221,6 +223,7 @@ def inject(problem: Problem, barrier: Barrier, config: FilterConfig, fault: Faul
             loop.step(i, first <= i < first + lasts)
     finally:
         gc.enable()
+        logging.disable(silenced)
         log.removeHandler(said)
         log.propagate = propagate
     return judge(loop, said.messages, first)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.condense import condense, hessian, hold_at, nearest, pick, verify
+from ppcbf_robots.condense import condense, hessian, hold_at, inside, nearest, pick, verify
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -36,6 +36,7 @@ _TINY = 1e-12
 _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
+LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
 SPEED_SHARE = 0.3  # of the way to the bound of the velocity domain that one control period may go
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, the passivity row is left out
 GAMMA_PER_RATE = 2.0  # times the least rate / u_max: with more, rows were infeasible in trials
@@ -374,16 +375,20 @@ class QPFilter:
         rows = np.hstack([C[near], np.ones((len(near), 1))])
         low, high = np.append(box[0], 0.0), np.append(box[1], 1e6)
         z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[near], low, high))
-        return None if z is None else np.clip(z[:n], *box)
+        if z is None or np.any(rows @ z < lower[near] - LOOSE * np.maximum(1.0, np.abs(lower[near]))):
+            return None  # the solver claims less of a violation than there is
+        return np.clip(z[:n], *box)
 
     def _ask(self, problem: QPProblem) -> Array | None:
-        """The solver's answer if it is one: of the right length and finite. Whatever a solver raises is none."""
+        """The solver's answer if it is one: of the right length and in the box. Whatever a solver raises is none."""
         try:
             z = self.solver.solve(problem)
         except Exception as error:
             log.warning("the QP solver failed: %s", error)
             return None
-        return z if z is not None and np.shape(z) == problem.g.shape and np.all(np.isfinite(z)) else None
+        if z is None or np.shape(z) != problem.g.shape:
+            return None
+        return z if inside(z, problem.box_low, problem.box_high, LOOSE) else None
 
     @staticmethod
     def _answer(z: Array | None, u_des: Array, u_max: Array, status: Status, reason: str, row: int) -> Correction:

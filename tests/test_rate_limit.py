@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
+from typer.testing import CliRunner
 
 from ppcbf_robots import filters
+from ppcbf_robots.cli.main import app
 from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, QPFilter, Status
@@ -295,3 +298,29 @@ def test_the_filter_takes_the_robots_rate_unless_told_another(two_link, cartpole
     for bad in (0.0, [1.0, -1.0], [1.0, 2.0, 3.0], "x", np.nan):
         with pytest.raises(InputError, match="rate: expected one positive number or 2, got"):
             limited(two_link, bad)
+
+
+def test_commands_take_the_rate(tmp_path, two_link):
+    """simulate keeps the option's or the spec's; info warns of a gamma that the rate cannot follow."""
+
+    def told(*arguments):
+        done = CliRunner().invoke(app, [*map(str, arguments), "--json"])
+        assert done.exit_code == 0, done.output
+        return json.loads(done.stdout)
+
+    brief = ("--duration", 0.1, "--out", tmp_path / "t.npz")
+    assert told("simulate", "two_link", "circle", *brief)["rate_violations"] is None
+    loose, tight = (told("simulate", "two_link", "circle", "--effort-rate", x, *brief) for x in (1e6, 40.0))
+    assert loose["rate_violations"] == tight["rate_violations"] == 0
+    assert loose["max_rate_ratio"] < 1e-2 and tight["max_rate_ratio"] == pytest.approx(1.0)
+    spec = tmp_path / "slow.yaml"
+    spec.write_text(f"urdf: {two_link.model.urdf}\neffort_rate: 40\nbarrier: {{gamma: 15}}\nbody: [{{frame: tip}}]\n")
+    found = told("info", spec)
+    assert [j["effort_rate"] for j in found["joints"]] == [40.0, 40.0]
+    most = 2.0 * 40.0 / two_link.model.u_max.max()
+    warning = f"gamma 15 is too fast for effort_rate, rows will often be infeasible: give at most {most:.2g}"
+    assert warning in found["warnings"]
+    assert told("info", "two_link")["joints"][0]["effort_rate"] is None
+    wrong = CliRunner().invoke(app, ["simulate", "two_link", "circle", "--effort-rate", "-1"])
+    assert isinstance(wrong.exception, InputError)
+    assert str(wrong.exception) == "--effort-rate: must be a positive number, got -1"

@@ -48,8 +48,21 @@ def name_of(arguments: list[str]) -> str:
 
 
 def test_the_readme_names_every_command() -> None:
-    one = {"info", "train", "simulate", "view", "export", "compare", "convert", "bench", "bench train", "sweep"}
-    one |= {"campaign", "report"}
+    one = {
+        "info",
+        "train",
+        "simulate",
+        "view",
+        "export",
+        "compare",
+        "convert",
+        "bench",
+        "bench train",
+        "sweep",
+        "faults",
+        "campaign",
+        "report",
+    }
     studies = {f"study {name}" for name in ("convergence", "variability", "safe-set", "nmpc")}
     assert {name_of(c) for c in commands()} == one | studies
 
