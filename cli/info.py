@@ -10,7 +10,7 @@ from rich.text import Text
 
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, obstacle_rows, out, table
 from ppcbf_robots.evidence import check_band
-from ppcbf_robots.filters import FilterConfig
+from ppcbf_robots.filters import FilterConfig, too_fast_for_rate
 from ppcbf_robots.problem import Problem, Robot, load_problem, load_robot
 from ppcbf_robots.shapes import smoothing_gap
 
@@ -50,6 +50,8 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
             f"u_des leaves the torque box on {outside:.1%} of X, most at '{joint}': "
             "there the filter must change it even without an obstacle, and the closed form exceeds the box"
         )
+    slow = too_fast_for_rate(model, robot.spec.barrier.gamma)
+    warnings += [slow] if slow else []
     facts: dict[str, Any] = {
         "robot": model.name,
         "urdf": str(model.urdf),
@@ -58,7 +60,7 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
         "joints": [
             {"name": n, "lower": _limit(model.q_lower[i]), "upper": _limit(model.q_upper[i]), "effort": model.u_max[i],
              "velocity": model.v_max[i], "kp": gains.kp[i], "kd": gains.kd[i], "max_spring": gains.max_spring[i],
-             "continuous": bool(model.continuous[i])}
+             "effort_rate": _limit(model.u_rate[i]), "continuous": bool(model.continuous[i])}
             for i, n in enumerate(model.joint_names)
         ],
         "locked": model.locked,

@@ -10,11 +10,14 @@ import typer
 from rich.text import Text
 
 from ppcbf_robots.cli.bench import bench
+from ppcbf_robots.cli.campaign import campaign
 from ppcbf_robots.cli.compare import compare
 from ppcbf_robots.cli.convert import convert
 from ppcbf_robots.cli.export import export
+from ppcbf_robots.cli.faults import faults
 from ppcbf_robots.cli.info import info
 from ppcbf_robots.cli.output import err
+from ppcbf_robots.cli.report import report
 from ppcbf_robots.cli.simulate import simulate
 from ppcbf_robots.cli.study import study
 from ppcbf_robots.cli.sweep import sweep
@@ -30,7 +33,7 @@ app = typer.Typer(
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
     "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed, 130 stopped by Ctrl-C.",
 )
-for command in (info, train, simulate, compare, view, export, convert, sweep):
+for command in (info, train, simulate, campaign, compare, view, export, convert, sweep, report, faults):
     app.command()(command)
 app.add_typer(bench, name="bench")
 app.add_typer(study, name="study")

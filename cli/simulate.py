@@ -17,10 +17,15 @@ from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
 from ppcbf_robots.resources import portable
+from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.rollout import RK4_STEP, Trajectory
 from ppcbf_robots.rollout import simulate as rollout
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array, vector
+
+EffortRateOption = Annotated[
+    float | None, typer.Option(help="How fast torques may change [N m/s]; else the robot spec's `effort_rate`.")
+]
 
 
 def simulate(
@@ -41,6 +46,7 @@ def simulate(
     goal: Annotated[str | None, typer.Option(metavar="Q,...", help="One number per moving joint.")] = None,
     duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="Simulated seconds.")] = 10.0,
     rate: Annotated[float, typer.Option(min=10.0, max=2000.0, help="Control rate [Hz].")] = 1000.0,
+    effort_rate: EffortRateOption = None,
     engine: Annotated[
         EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")
     ] = "pinocchio",
@@ -51,7 +57,7 @@ def simulate(
 
     Example: ppcbf simulate panda sphere --barrier runs/panda --duration 5 --out runs/panda.npz
     """
-    problem = load_problem(robot, obstacles)
+    problem = limit_rate(load_problem(robot, obstacles), effort_rate)
     model = problem.model
     q = _angles(problem, start, "--start", problem.robot.start)
     given = parse_vector(velocity, "--velocity")
@@ -76,6 +82,15 @@ def simulate(
         )
     if not trajectory.meta["complete"]:
         raise CheckFailed(f"the simulation diverged at {trajectory.t[-1]:.3f} s; {out_file} holds what there is")
+
+
+def limit_rate(problem: Problem, effort_rate: float | None) -> Problem:
+    """The problem just loaded with another limit of how fast every torque may change [N m/s | N/s]."""
+    if effort_rate is not None:
+        if not effort_rate > 0.0:
+            raise InputError(f"--effort-rate: must be a positive number, got {effort_rate:g}")
+        problem.model.u_rate = np.full(problem.model.nv, effort_rate)
+    return problem
 
 
 def outside_domain(problem: Problem, trajectory: Trajectory) -> float:
@@ -119,29 +134,33 @@ def run(
     engine: EngineName = "pinocchio",
 ) -> Trajectory:
     """A rollout with a progress bar; meta names robot, world, barrier and filter."""
-    moved_by = _mujoco(problem) if engine == "mujoco" else None
+    moved_by = mujoco_engine(problem) if engine == "mujoco" else None
     runtime = None
     if barrier is not None:
         runtime = SafetyFilter(problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd)
-    described = {
-        "robot": portable(problem.robot.name),
-        "obstacles": portable(problem.world_name),
-        "barrier_kind": barrier.kind if barrier else "none",
-        "filter": config.kind if barrier else "none",
-        "metric": config.metric if barrier else "none",
-        **meta,
-    }
     ticks = iter(track(range(max(1, round(duration / config.dt) // 50)), "simulating", console=err, transient=True))
     trajectory = rollout(
-        problem.safety, problem.robot.controller, runtime, q, v, duration, config.dt, described,
-        on_step=lambda t: next(ticks, None), engine=moved_by,
+        problem.safety, problem.robot.controller, runtime, q, v, duration, config.dt,
+        described(problem, barrier, config) | meta, on_step=lambda t: next(ticks, None), engine=moved_by,
     )  # fmt: skip
     for _ in ticks:
         pass
     return trajectory
 
 
-def _mujoco(problem: Problem) -> Engine:
+def described(problem: Problem, barrier: Barrier | None, config: FilterConfig) -> dict[str, Any]:
+    """What a trajectory's meta says of how it was made."""
+    return {
+        "robot": portable(problem.robot.name),
+        "obstacles": portable(problem.world_name),
+        "barrier_kind": barrier.kind if barrier else "none",
+        "filter": config.kind if barrier else "none",
+        "metric": config.metric if barrier else "none",
+    }
+
+
+def mujoco_engine(problem: Problem, plant: RobotModel | None = None) -> Engine:
+    """MuJoCo with the problem's robot, or another plant; InputError where it is not installed."""
     try:
         from ppcbf_robots.engine_mujoco import MujocoEngine  # MuJoCo only where it is asked for
     except ModuleNotFoundError as error:
@@ -150,7 +169,7 @@ def _mujoco(problem: Problem) -> Engine:
         raise InputError(
             '--engine mujoco needs the mujoco package; remedy: pip install "ppcbf-robots[mujoco]"'
         ) from None
-    return MujocoEngine(problem)
+    return MujocoEngine(problem, plant)
 
 
 def _angles(problem: Problem, text: str | None, what: str, default: Array) -> Array:
@@ -166,6 +185,9 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
     )
     out.print(f"least h            {facts['min_h']:.4f}  (obstacles alone {facts['clearance']:.4f} m)")
     out.print(f"largest torque     {facts['max_torque_ratio']:.3f} of its limit")
+    if facts["rate_violations"] is not None:
+        over = f", over it in {facts['rate_violations']} steps" if facts["rate_violations"] else ""
+        out.print(f"fastest torque     {facts['max_rate_ratio']:.3f} of its rate limit{over}")
     out.print(
         f"energy             rises by {facts['energy_rise']:.2g} of V0, {facts['injected']:.3g} J injected in all"
     )

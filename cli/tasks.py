@@ -33,26 +33,37 @@ IterationsOption = Annotated[int | None, typer.Option(min=1, help="Planned itera
 TimeLimitOption = Annotated[float, typer.Option(min=1.0, help="Stop each training after so many seconds.")]
 
 
-def run_tasks(tasks: Sequence[Task], folder: Path, jobs: int, dask: str | None) -> list[Record]:
-    """Records of all tasks, with a bar on stderr; Ctrl-C says how to go on."""
+def run_tasks(
+    tasks: Sequence[Task], folder: Path, jobs: int, dask: str | None, what: str = "trainings"
+) -> list[Record]:
+    """Records of all tasks, with a bar on stderr; Ctrl-C says how to go on.
+
+    A task whose key has a ``count`` does as many of what the bar counts.
+    """
     path, found, failed = folder / RESULTS, 0, 0
+
+    def size(key: dict[str, Any]) -> int:
+        return int(key.get("count", 1))
+
+    total = sum(size(task.key) for task in tasks)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out: {folder} is a file; give a folder")
-    columns = (TextColumn("trainings"), BarColumn(bar_width=24), MofNCompleteColumn(),
+    columns = (TextColumn(what), BarColumn(bar_width=24), MofNCompleteColumn(),
                TextColumn("{task.fields[failed]}"), TimeElapsedColumn())  # fmt: skip
     with Progress(*columns, console=err) as progress:
-        bar = progress.add_task("", total=len(tasks), failed="")
+        bar = progress.add_task("", total=total, failed="")
 
         def on_record(record: Record) -> None:
             nonlocal found, failed
-            found, failed = found + 1, failed + ("error" in record)
+            count = size(record["key"])
+            found, failed = found + count, failed + count * ("error" in record)
             progress.update(bar, completed=found, failed=f"{failed} failed" if failed else "")
 
         try:
             return run_sweep(tasks, path, jobs, dask, on_record)
         except KeyboardInterrupt:
             progress.stop()
-            said = f"stopped: {found} of {len(tasks)} are in {path}; the same command goes on from there"
+            said = f"stopped: {found} of {total} are in {path}; the same command goes on from there"
             err.print(said, soft_wrap=True)
             raise
 

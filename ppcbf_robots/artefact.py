@@ -130,7 +130,7 @@ def load_barrier(folder: Path) -> StoredBarrier:
         weights = (folder / "weights.safetensors").read_bytes()
     except FileNotFoundError as error:
         raise InputError(f"{folder} is not a barrier folder: {Path(error.filename).name} is missing") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     if isinstance(data, dict) and data.get("format") in range(1, FORMAT):
         raise InputError(f"{path}: a barrier of an earlier version, which this one cannot read; train it again")

@@ -73,9 +73,12 @@ def measure(problem: Problem, barrier: Barrier, config: FilterConfig, steps: int
     Raises:
         InputError: if no such state is found.
     """
-    runtime = SafetyFilter(problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd)
+    runtime = SafetyFilter(
+        problem.model, problem.safety, barrier, config, problem.robot.controller.gains.kd, rate=np.inf
+    )
     states = _states(problem, barrier, runtime)
     whole = np.empty(steps)
+    runtime.reset()
     for i in range(steps):
         q, v, u_des, d_p = states[i % len(states)]
         began = time.perf_counter_ns()
@@ -94,10 +97,10 @@ def _states(problem: Problem, barrier: Barrier, runtime: SafetyFilter) -> Sequen
     rng, model = np.random.default_rng(0), problem.model
     found: list[tuple[Array, Array, Array, float]] = []
     q, v, _ = uniform_band(problem, barrier, 4 * STATES, rng)
-    for qi, vi in zip(q, v, strict=True):
+    for i, (qi, vi) in enumerate(zip(q, v, strict=True)):
         goal = model.from_angles(problem.robot.domain.sample_q(rng, 1)[0])
         nominal = problem.robot.controller.with_goal(goal).evaluate(model.evaluate(qi, vi))
-        if runtime.step(0.0, qi, vi, nominal.u, float(nominal.d_p)).status is Status.CORRECTING:
+        if runtime.step(float(i), qi, vi, nominal.u, float(nominal.d_p)).status is Status.CORRECTING:
             found.append((qi, vi, nominal.u, float(nominal.d_p)))
         if len(found) == STATES:
             break

@@ -13,7 +13,8 @@ from ppcbf_robots.kernels import kernel
 @kernel
 def condense(
     hdot: Any, phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
-    alpha: float, release: float, speed_alpha: float, margin: float, flat: float, tolerance: float,
+    low: Any, high: Any, alpha: float, release: float, speed_alpha: float, margin: float, flat: float,
+    tolerance: float,
     C: Any, lower: Any, norm: Any, binding: Any,
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill the rows ``C z >= lower`` of ``z = (u - u_des) / u_max``.
@@ -28,6 +29,7 @@ def condense(
         Minv, b, v: of the state.
         v_domain: (nv, 2), or (0, 2) for no such rows.
         u_des, u_max: (nv,).
+        low, high: (nv,) bounds of z.
         alpha: class-K gain [1/s].
         release: what joins it for pairs that separate [1/s].
         speed_alpha: that of the velocity domain [1/s].
@@ -63,13 +65,31 @@ def condense(
         center = reach = 0.0
         for j in range(nv):
             C[k, j] /= scale
-            center -= C[k, j] * u_des[j] / u_max[j]
-            reach += abs(C[k, j])
+            center += 0.5 * C[k, j] * (low[j] + high[j])
+            reach += 0.5 * abs(C[k, j]) * (high[j] - low[j])
         binding[k] = lower[k] > center - reach
         hold = hold and slack >= 0.0
         if k < R and lower[k] > center + reach + tolerance and (hopeless < 0 or lower[k] > worst):
             hopeless, worst = k, lower[k]
     return hopeless, hold
+
+
+@kernel
+def hold_at(
+    hdot: Any, phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
+    alpha: float, release: float, speed_alpha: float, margin: float, flat: float, tolerance: float, hold: Any,
+) -> None:  # fmt: skip
+    """Whether all rows of :func:`condense` hold at u_des, and u_des is in the box, for a batch: hold (B,) is filled."""
+    count, nv = phi.shape[1] + 2 * len(v_domain), len(u_max)
+    C, lower, norm, binding = np.empty((count, nv)), np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
+    for s in range(len(v)):
+        low, high = -1.0 - u_des[s] / u_max, 1.0 - u_des[s] / u_max
+        _, hold[s] = condense(
+            hdot[s], phi[s], Lf[s], Lg[s], Minv[s], b[s], v[s], v_domain, u_des[s], u_max, low, high,
+            alpha, release, speed_alpha, margin, flat, tolerance, C, lower, norm, binding,
+        )  # fmt: skip
+        for j in range(nv):
+            hold[s] = hold[s] and low[j] <= 0.0 and high[j] >= 0.0
 
 
 @kernel
@@ -113,6 +133,15 @@ def verify(C: Any, lower: Any, binding: Any, z: Any, tolerance: float, missed: A
         if residual < least:
             tightest, least = k, residual
     return count, tightest, least
+
+
+@kernel
+def inside(z: Any, low: Any, high: Any, tolerance: float) -> bool:
+    """Whether every entry of z (n,) is finite and within its bounds."""
+    found = True
+    for i in range(len(z)):
+        found = found and low[i] - tolerance <= z[i] <= high[i] + tolerance
+    return found
 
 
 @kernel

@@ -74,13 +74,16 @@ class NominalController:
         force, _ = self.spring(q, goal_angles)
         return np.asarray(-force if self.gains.kind == "shaping" else g - force)
 
-    def evaluate(self, dyn: Dynamics) -> Nominal:
-        """Torque, storage and dissipation at one state."""
-        force, P = self.spring(dyn.q)
+    def evaluate(self, dyn: Dynamics, goals: Array | None = None) -> Nominal:
+        """Torque, storage and dissipation at one state, or at a batch with a goal (B, nq) for each."""
+        force, P = self.spring(dyn.q, None if goals is None else self.robot.to_angles(goals))
         damping = self.gains.kd * dyn.v
         u = -force - damping
         if self.gains.kind == "shaping":
-            P = P + self.robot.potential_energy(dyn.q) - self._U0
+            at, potential = dyn.q, self.robot.potential_energy
+            P = P + (potential(at) - self._U0 if goals is None else [
+                potential(x) - potential(goal) for x, goal in zip(at, goals, strict=True)
+            ])  # fmt: skip
         else:
             u = u + dyn.g
         return Nominal(u, np.asarray(dyn.kinetic_energy + P), np.asarray((dyn.v * damping).sum(-1)))

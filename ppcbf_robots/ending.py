@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import nnls
 
+from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.specs import Array
 
@@ -105,14 +106,14 @@ def judge(
         touches: contacts of the last state.
     """
     model, t, q = safety.robot, run["t"], run["q"]
-    errors = np.array([np.abs(model.difference(x, goal)).max() for x in q])
+    errors = _largest_difference(model, q, goal)
     error = float(errors[-1])
     if error < GOAL_TOLERANCE:
         outside = np.flatnonzero(errors >= GOAL_TOLERANCE)
         return Ending("goal", error, float(t[outside[-1] + 1] if len(outside) else t[0]))
     first = int(np.searchsorted(t, t[-1] - WINDOW - 1e-9))
     span = max(float(t[-1] - t[first]), 1e-9)
-    strayed = max(float(np.abs(model.difference(x, q[-1])).max()) for x in q[first:])
+    strayed = float(_largest_difference(model, q[first:], q[-1]).max())
     if strayed > STILL * span or len(t) == 1:
         speeds = np.abs(run["v"][first:]).mean(axis=0)
         joint = int(speeds.argmax())
@@ -130,6 +131,13 @@ def judge(
     if deciding and np.abs(delta / u_max).max() > NO_LOAD:
         return Ending("held", error, None, {deciding: None}, at_limit=at_limit, touches=touches)
     return Ending("stalled", error, at_limit=at_limit, touches=touches)
+
+
+def _largest_difference(model: RobotModel, q: Array, other: Array) -> Array:
+    """Largest joint difference (T,) of configurations (T, nq) to another one (nq,)."""
+    apart = model.to_angles(q) - model.to_angles(other)
+    turned = (apart + np.pi) % (2.0 * np.pi) - np.pi
+    return np.asarray(np.abs(np.where(model.continuous, turned, apart)).max(axis=1))
 
 
 def bearing_rows(rows: SafetyRows, share: Array, u_max: Array) -> list[tuple[int, float]]:

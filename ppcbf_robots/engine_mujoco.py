@@ -1,7 +1,7 @@
 """MuJoCo as engine: the same robot and world in another simulator, with contact between the two.
 
 The robot is built from Pinocchio's reduced model, joint by joint, not from the URDF: locked joints, payloads and merged
-links are then the same by construction. Joints have neither limits, damping nor friction. Each link has the shapes of
+links are then the same by construction. Joints have neither limits nor damping. Each link has the shapes of
 its collision geometry, meshes as their convex hulls; links without readable geometry have the robot's body spheres.
 Where a hull touches, the mesh itself is looked at, and the contact says whether it is the hull's alone.
 Robot and obstacles touch; the robot's links pass through each other, and what is fixed to the base touches nothing.
@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 
 _POINT = 1e-6  # [m], radius of body spheres without one; MuJoCo has no points
 _THIN = 2e-4  # [m], least extent of a mesh: a flat one has no convex hull
+_HARD = 0.9999  # impedance of dry friction
 _PLANE_SIZE = [0.0, 0.0, 1.0]  # without end; the last is the spacing of a drawn grid
 
 
@@ -57,13 +58,14 @@ class _Placed(NamedTuple):
 class MujocoEngine:
     """A problem's robot and world in MuJoCo (see :class:`ppcbf_robots.engines.Engine`), integrated by RK4.
 
-    ``model`` and ``data`` are MuJoCo's own; ``dofs`` (nv,) holds the address of each of the robot's joints there.
+    ``plant`` moves instead of the problem's robot (see :mod:`ppcbf_robots.plant`), with its dry friction. ``model`` and
+    ``data`` are MuJoCo's own; ``dofs`` (nv,) holds the address of each of the robot's joints there.
     """
 
     name: EngineName = "mujoco"
 
-    def __init__(self, problem: Problem) -> None:
-        self.robot = problem.model
+    def __init__(self, problem: Problem, plant: RobotModel | None = None) -> None:
+        self.robot = plant or problem.model
         spec = mujoco.MjSpec()
         _set_options(spec, self.robot)
         links = _add_links(spec, self.robot)
@@ -76,6 +78,8 @@ class MujocoEngine:
         joints = [self.model.joint(_name(i)) for i in range(1, len(links))]
         self.dofs = np.array([int(j.dofadr[0]) for j in joints])
         self._qpos = np.array([int(j.qposadr[0]) for j in joints])
+        self.model.dof_frictionloss[self.dofs] = self.robot.friction
+        self.model.dof_solimp[self.dofs, :2] = _HARD  # by default friction gives way and the joint creeps
         self._placed = {self.model.geom(name).id: part for name, part in geoms}
         self._mesh_contact = MeshContact(problem.world.obstacles)
 

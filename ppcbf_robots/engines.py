@@ -16,6 +16,7 @@ from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array
 
 EngineName = Literal["pinocchio", "mujoco"]
+RUB_SWEEPS = 20
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,13 @@ class Engine(Protocol):
 
 
 class PinocchioEngine:
-    """Free motion by Pinocchio's forward dynamics and RK4; obstacles do not push back."""
+    """Free motion by Pinocchio's forward dynamics and RK4, then the joints' dry friction; no obstacle pushes back."""
 
     name: EngineName = "pinocchio"
 
     def __init__(self, robot: RobotModel) -> None:
         self.robot = robot
+        self._dry = bool(np.any(robot.friction > 0.0))
         self._q, self._v = np.zeros(robot.nq), np.zeros(robot.nv)
 
     def reset(self, q: Array, v: Array) -> None:
@@ -67,6 +69,8 @@ class PinocchioEngine:
         """See :class:`Engine`."""
         for _ in range(count):
             self._q, self._v = _rk4(self.robot, self._q, self._v, u, dt)
+            if self._dry:
+                self._v = _rub(self.robot, self._q, self._v, dt)
 
     def contacts(self) -> None:
         """None: there is no contact here."""
@@ -113,3 +117,19 @@ def _rk4(model: RobotModel, q: Array, v: Array, u: Array, dt: float) -> tuple[Ar
     a4 = model.acceleration(model.integrate(q, dt * v3), v4, u)
     mean_v = (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
     return model.integrate(q, dt * mean_v), v + dt * (a1 + 2.0 * a2 + 2.0 * a3 + a4) / 6.0
+
+
+def _rub(model: RobotModel, q: Array, v: Array, dt: float) -> Array:
+    """Velocity after Coulomb friction over dt, by time stepping (Moreau): the impulse p with ``|p_i| <= friction_i dt``
+    that leaves the least kinetic energy, by projected Gauss-Seidel, which never adds any.
+
+    A joint sticks where its friction can hold it.
+    """
+    Minv = model.evaluate(q, v).Minv
+    bound, p, v = model.friction * dt, np.zeros(model.nv), v.copy()
+    for _ in range(RUB_SWEEPS):
+        for i in range(model.nv):
+            wanted = min(max(p[i] + v[i] / Minv[i, i], -bound[i]), bound[i])
+            v -= Minv[:, i] * (wanted - p[i])
+            p[i] = wanted
+    return v

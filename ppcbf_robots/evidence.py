@@ -123,7 +123,7 @@ def check_band(
     for qi, vi in zip(q, v, strict=True):
         dyn = problem.model.evaluate(qi, vi)
         nominal = problem.robot.controller.evaluate(dyn)
-        result = runtime.filter(0.0, dyn, nominal.u, float(nominal.d_p) if passive else None)
+        result = runtime.filter(dyn, nominal.u, float(nominal.d_p) if passive else None)
         bad = result.status >= Status.PASSIVITY_DROPPED
         if config.kind == "closed-form" and result.status is not Status.FREE:
             power, d_p = float(vi @ (result.u - nominal.u)), float(nominal.d_p)

@@ -7,7 +7,8 @@ wherever K_theta is convex in v.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal, get_args
 
@@ -15,27 +16,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.condense import condense, hessian, nearest, pick, verify
+from ppcbf_robots.condense import condense, hessian, hold_at, inside, nearest, pick, verify
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.specs import Array
 
+log = logging.getLogger(__name__)
+
 Metric = Literal["torque", "kinetic"]
 FilterKind = Literal["closed-form", "qp"]
 
 Row = tuple[Array, float]  # (n,) of length 1 and its lower bound
-Box = tuple[Array, Array]  # (n,) bounds of the dimensionless correction
+Box = tuple[Array, Array]  # (n,) bounds of a torque, or of the dimensionless correction
 Solution = tuple[Array, int]  # dimensionless correction and the row that it rests on, -1 if none
 
 _TINY = 1e-12
 _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
+LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
 FAST_SHARE = 0.5  # of the way to a bound that one control period may go, where acting late costs nothing
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, an arm counts as at rest
 FREE_POWER = 2e-3  # of u_max · v_max, by which a correction may exceed d_p: near rest (9) cannot hold exactly
+GAMMA_PER_RATE = 2.0  # times the least rate / u_max: with more, rows were infeasible in trials
 LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
 
 
@@ -63,6 +68,8 @@ class FilterConfig:
     margin: float = 1e-3  # [m/s], phi kept above by the QP, for the control period's discretisation
     near_rows: int = 16  # rows handed to the QP; the rest are checked afterwards
     max_hold: float = 0.02  # [s], how long an invalid state is bridged before STOP
+    max_age: float = 0.005  # [s], how old or how often repeated a state may be before it is invalid
+    slip_time: float = 0.01  # [s], over which the slip of phi is averaged that the QP makes up for; infinite for none
     dt: float = 1e-3  # [s], control period
 
     @property
@@ -79,9 +86,11 @@ class FilterConfig:
         for name, allowed in (("kind", get_args(FilterKind)), ("metric", get_args(Metric))):
             if getattr(self, name) not in allowed:
                 raise InputError(f"filter {name}: expected one of {', '.join(allowed)}, got '{getattr(self, name)}'")
-        for name in ("alpha", "dt", "max_hold", "near_rows"):
+        for name in ("alpha", "dt", "max_hold", "max_age", "near_rows"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"filter {name}: must be a positive number, got {getattr(self, name)}")
+        if not self.slip_time > 0.0:
+            raise InputError(f"filter slip_time: must be a positive number, got {self.slip_time}")
         if not (np.isfinite(self.margin) and self.margin >= 0.0):
             raise InputError(f"filter margin: must be a number of at least 0, got {self.margin}")
 
@@ -98,22 +107,29 @@ class Correction:
 
 @dataclass(frozen=True)
 class QPRows:
-    """All rows ``C z >= lower`` of the dimensionless correction; the barrier's first, then the velocity domain's."""
+    """What binds the dimensionless correction z: rows ``C z >= lower``, the barrier's before the velocity domain's, and
+    the box."""
 
     C: Array  # (rows, nv), of length 1
     lower: Array  # (rows,)
     norm: Array  # (rows,) length before, in units of phi̇ per full torque
     binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
     barrier_rows: int
+    box: Box  # (nv,) bounds of z
+    limits: str  # what the box holds, in words
 
     def without_speed(self) -> QPRows:
         """The barrier's rows alone."""
         n = self.barrier_rows
-        return QPRows(self.C[:n], self.lower[:n], self.norm[:n], self.binding[:n], n)
+        return QPRows(self.C[:n], self.lower[:n], self.norm[:n], self.binding[:n], n, self.box, self.limits)
 
 
 class ClosedForm:
-    """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to)."""
+    """Eq. (8)/(13) for the row of least phi; does not enforce the torque box (the barrier was trained to).
+
+    Where the torque's rate is limited, :class:`ppcbf_robots.safety_filter.SafetyFilter` clips its answer to box and
+    rate.
+    """
 
     def __init__(self, barrier: Barrier, config: FilterConfig) -> None:
         self.barrier, self.config = barrier, config
@@ -126,9 +142,25 @@ class ClosedForm:
         return np.asarray(near | (rows.phi <= spec.epsilon))  # a state beyond the band must not pass unfiltered
 
     def correct(
-        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array
+        self,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        u_max: Array,
+        allowed: Box | None = None,
     ) -> Correction:
-        """The paper's correction; d_p and u_max do not enter it."""
+        """The paper's correction; d_p and u_max do not enter it. ``allowed`` bounds clip it, and that is said."""
+        answer = self._formula(dyn, safety, rows, u_des)
+        u = answer.u if allowed is None else np.clip(answer.u, *allowed)
+        if (u == answer.u).all():
+            return answer
+        if answer.status is Status.FREE:
+            return Correction(u, Status.CORRECTING, "u_des clipped to box and rate", -1)
+        return Correction(u, Status.INFEASIBLE, "the correction is clipped to box and rate", answer.row)
+
+    def _formula(self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array) -> Correction:
         active = np.flatnonzero(self._active(rows))
         if not active.size:
             return Correction(u_des, Status.FREE, "outside the band", -1)
@@ -144,6 +176,10 @@ class ClosedForm:
         if gain < _TINY:
             return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
         return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
+
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
+        """As :meth:`QPFilter.passes`; nothing is known before each state is looked at."""
+        return np.zeros(len(u_des), dtype=np.bool_)
 
     def _damp(self, dyn: Dynamics, safety: SafetyRows, k: int, u_des: Array) -> Correction:
         """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one period.
@@ -188,62 +224,121 @@ def free_power(robot: RobotModel) -> float:
     return FREE_POWER * float(robot.u_max @ robot.v_max)
 
 
+def slowest_joint(robot: RobotModel, rate: Array) -> float:
+    """Least ``rate / u_max`` of all joints [1/s], infinite where no rate is limited."""
+    return float(np.min(rate / robot.u_max))
+
+
+def too_fast_for_rate(robot: RobotModel, gamma: float) -> str:
+    """A warning if the barrier brakes faster than torques can be built up, empty otherwise."""
+    most = GAMMA_PER_RATE * slowest_joint(robot, robot.u_rate)
+    if gamma <= most:
+        return ""
+    return f"gamma {gamma:g} is too fast for effort_rate, rows will often be infeasible: give at most {most:.2g}"
+
+
 class QPFilter:
     """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
 
     Rows are ``psi_k(u) >= -alpha (phi_k - margin) - fast_alpha max(0, min(ḣ_k, phi_k))`` (of the PP-CBF
     ``psi_k(u) >= -gamma_K phi_k``), the velocity domain's, and ``vᵀ δ <= d_p + FREE_POWER u_max · v_max``. The near
-    rows are those closest to violation by u_des, each in units of the correction it needs;
-    the others are checked afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
+    rows are those closest to violation by u_des, each in units of the correction it needs; the others are checked
+    afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
     solution, the velocity domain is given up first, then passivity; then the least violation is sought.
+
+    Under a limited rate no class-K gain is above the least ``rate / u_max`` of all joints: a row that comes into force
+    faster than a torque can be built up finds no solution, and what then follows throws the arm about.
+
+    Args:
+        barrier: gives the rows.
+        safety: what they are rows of.
+        config: settings.
+        rate: of the torques (nv,) [N m/s | N/s]; matters where ``correct`` is given bounds of the torque.
     """
 
-    def __init__(self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig) -> None:
+    def __init__(
+        self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig, rate: Array | None = None
+    ) -> None:
         self.barrier, self.safety, self.config = barrier, safety, config
+        self.fastest = np.inf if rate is None else slowest_joint(safety.robot, rate)
         self.solver: QPSolver = make_solver(config.solver)
 
-    def _condense(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[QPRows, int, bool]:
-        energy = self.barrier.kind == "pp-cbf"
-        alpha = self.barrier.spec.gamma_K if energy else self.config.alpha
+    def _class_k(self, limited: bool) -> tuple[float, float, float, float]:
+        """Class-K gains [1/s] of the barrier's rows, added for pairs that separate, and of the velocity domain; margin."""
+        fastest, fast = self.fastest if limited else np.inf, self.config.fast_alpha
+        if self.barrier.kind == "pp-cbf":
+            return min(self.barrier.spec.gamma_K, fastest), 0.0, min(fast, fastest), 0.0
+        alpha = min(self.config.alpha, fastest)
+        return alpha, min(fast, fastest - alpha), min(fast, fastest), self.config.margin
+
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
+        """Whether :meth:`correct` leaves u_des (B, nv) as it is, (B,), for a batch of states and no limited rate."""
+        hold = np.empty(len(u_des), dtype=np.bool_)
+        hold_at(
+            rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            *self._class_k(False), _FLAT, ROW_TOLERANCE, hold,
+        )  # fmt: skip
+        return hold
+
+    def _condense(
+        self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array, allowed: Box | None
+    ) -> tuple[QPRows, int, bool]:
         count, nv = len(rows.phi) + 2 * len(self.safety.v_domain), len(u_max)
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
         binding = np.empty(count, dtype=np.bool_)
+        lowest, highest = allowed or (-u_max, u_max)
+        box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
         hopeless, hold = condense(
             rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            alpha, 0.0 if energy else self.config.fast_alpha, self.config.fast_alpha,
-            0.0 if energy else self.config.margin, _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
+            *box, *self._class_k(allowed is not None), _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
         )  # fmt: skip
-        return QPRows(C, lower, norm, binding, len(rows.phi)), hopeless, hold
+        limits = "box" if allowed is None else "box and rate"
+        return QPRows(C, lower, norm, binding, len(rows.phi), box, limits), hopeless, hold
 
     def correct(
-        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array
+        self,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        u_max: Array,
+        allowed: Box | None = None,
     ) -> Correction:
-        """The least correction in the configured metric, checked before it is returned; ``rows`` say all of safety."""
-        qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max)
-        if hold and np.all(np.abs(u_des) <= u_max):
+        """The least correction in the configured metric, checked before it is returned; ``rows`` say all of safety.
+
+        ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
+        """
+        qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max, allowed)
+        if hold and np.all(qp.box[0] <= 0.0) and np.all(qp.box[1] >= 0.0):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
-        share = u_des / u_max
-        box = (-1.0 - share, 1.0 - share)
+        answer = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
+        return answer if allowed is None else replace(answer, u=np.clip(answer.u, *allowed))
+
+    def _ladder(
+        self, dyn: Dynamics, qp: QPRows, hopeless: int, u_des: Array, d_p: float | None, u_max: Array
+    ) -> Correction:
+        """The QP, and what takes its place where it has no solution."""
         if hopeless >= 0:
             flat = qp.norm[hopeless] < _FLAT
-            reason = "L_g phi is zero on a violated row" if flat else "a row is out of reach of the torque box"
-            z = self._least_violation(dyn, qp, box, u_max)
+            reason = "L_g phi is zero on a violated row" if flat else f"a row is out of reach of the torque {qp.limits}"
+            z = self._least_violation(dyn, qp, u_max)
             return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, hopeless)
         passivity = self._passivity_row(dyn, d_p, u_max)
-        solved, reason = self._solve(dyn, qp, passivity, box, u_max), "constraint active"
+        solved, reason = self._solve(dyn, qp, passivity, u_max), "constraint active"
         if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
             qp, reason = qp.without_speed(), "constraint active, the velocity domain given up"
-            solved = self._solve(dyn, qp, passivity, box, u_max)
+            solved = self._solve(dyn, qp, passivity, u_max)
         if solved is not None:
             return self._answer(solved[0], u_des, u_max, Status.CORRECTING, reason, solved[1])
         if passivity is not None:
-            solved = self._solve(dyn, qp, None, box, u_max)
+            solved = self._solve(dyn, qp, None, u_max)
         if solved is not None:
-            reason = "rows and box allow no passive torque"
+            reason = f"rows and {qp.limits} allow no passive torque"
             return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
-        z = self._least_violation(dyn, qp, box, u_max)
+        z = self._least_violation(dyn, qp, u_max)
         k = int(np.argmax(qp.lower[: qp.barrier_rows]))
-        return self._answer(z, u_des, u_max, Status.INFEASIBLE, "no torque in the box satisfies all rows", k)
+        return self._answer(z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", k)
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p + free_power as (row, lower) of length 1; None where every torque satisfies it."""
@@ -256,9 +351,9 @@ class QPFilter:
     def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
         return np.asarray(hessian(dyn.Minv, u_max, self.config.metric == "kinetic"))
 
-    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, box: Box, u_max: Array) -> Solution | None:
+    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, u_max: Array) -> Solution | None:
         """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
-        H, no_row = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0)
+        H, no_row, box = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0), qp.box
         chosen = nearest(qp.lower, qp.binding, self.config.near_rows)
         missed = np.empty(len(qp.lower), dtype=np.bool_)
         for _ in range(4):
@@ -277,9 +372,9 @@ class QPFilter:
             chosen = np.union1d(chosen, np.flatnonzero(missed))
         return None
 
-    def _least_violation(self, dyn: Dynamics, qp: QPRows, box: Box, u_max: Array) -> Array | None:
+    def _least_violation(self, dyn: Dynamics, qp: QPRows, u_max: Array) -> Array | None:
         """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted."""
-        n = len(u_max)
+        n, box = len(u_max), qp.box
         steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
         if not len(steerable):
             return np.clip(np.zeros(n), *box)
@@ -293,12 +388,20 @@ class QPFilter:
         rows = np.hstack([C[near], np.ones((len(near), 1))])
         low, high = np.append(box[0], 0.0), np.append(box[1], 1e6)
         z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[near], low, high))
-        return None if z is None else np.clip(z[:n], *box)
+        if z is None or np.any(rows @ z < lower[near] - LOOSE * np.maximum(1.0, np.abs(lower[near]))):
+            return None  # the solver claims less of a violation than there is
+        return np.clip(z[:n], *box)
 
     def _ask(self, problem: QPProblem) -> Array | None:
-        """The solver's answer if it is one: of the right length and finite."""
-        z = self.solver.solve(problem)
-        return z if z is not None and np.shape(z) == problem.g.shape and np.all(np.isfinite(z)) else None
+        """The solver's answer if it is one: of the right length and in the box. Whatever a solver raises is none."""
+        try:
+            z = self.solver.solve(problem)
+        except Exception as error:
+            log.warning("the QP solver failed: %s", error)
+            return None
+        if z is None or np.shape(z) != problem.g.shape:
+            return None
+        return z if inside(z, problem.box_low, problem.box_high, LOOSE) else None
 
     @staticmethod
     def _answer(z: Array | None, u_des: Array, u_max: Array, status: Status, reason: str, row: int) -> Correction:

@@ -191,6 +191,22 @@ def force_limits(
     return found[0], found[1]
 
 
+def rate_limits(path: Path, names: Sequence[str], rate: PerJoint | None) -> Array:
+    """How fast the effort of each joint may change (nv,) [N m/s | N/s], infinite for joints not named.
+
+    Raises:
+        InputError: unless every rate is positive.
+    """
+    free = np.full(len(names), np.inf)
+    if rate is None:
+        return free
+    rates = per_joint(rate, names, "effort_rate", default=free)
+    wrong = [(n, x) for n, x in zip(names, rates, strict=True) if not x > 0.0]
+    if wrong:
+        raise InputError(f"{path}: effort_rate: joint '{wrong[0][0]}' needs a positive number, got {wrong[0][1]:g}")
+    return rates
+
+
 def position_limits(
     path: Path,
     names: Sequence[str],

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.joints import lock
+from ppcbf_robots.resources import is_file
 from ppcbf_robots.specs import Array
 
 MAX_BYTES = 50_000_000
@@ -107,7 +108,7 @@ def find_mesh(name: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | Non
     else:
         plain = name.removeprefix("file://")
         candidates = [folder / plain for folder in (urdf.resolve().parent, *package_dirs)]
-    return next((c for c in candidates if _is_file(c)), None)
+    return next((c for c in candidates if is_file(c)), None)
 
 
 def mesh_problem(path: Path) -> str:
@@ -139,10 +140,3 @@ def count_triangles(suffix: str, content: bytes) -> int:
             return max(map(int, re.findall(rb"element\s+\w+\s+(\d{1,18})", content[:65536])), default=0)
     found = re.findall(rb"<(?:triangles|polylist|polygons)\b[^>]{0,200}?\bcount=[\"'](\d{1,18})", content)
     return sum(map(int, found))
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()  # not a folder, pipe or device
-    except (OSError, ValueError):  # too long, not permitted
-        return False

@@ -26,6 +26,7 @@ from ppcbf_robots.world_shapes import surface_points
 
 GRID = 121  # points per axis of a safe-set slice
 MAX_JOINTS = 8
+MAX_POINTS = 1000  # of a curve over time
 
 
 def plot_runs(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> None:
@@ -55,6 +56,33 @@ def plot_runs(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> N
     handles, labels = axes[0, 0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="upper center", ncols=min(4, len(labels)), frameon=False)
     save_figure(fig, path, top=1.0 - 0.5 / (2.3 * (joints + 1)))
+
+
+def plot_run(problem: Problem, run: Trajectory, path: Path) -> None:
+    """h, phi, V and the torques relative to their limits over time; shaded where the filter corrects."""
+    fig, axes = plt.subplots(4, 1, figsize=(10, 9), sharex=True)
+    every = max(1, len(run.t) // MAX_POINTS)
+    t = run.t[::every]
+    curves = {"least h [m | rad]": run.h, "least phi [m/s]": run.phi, "storage V [J]": run.V}
+    for ax, (label, values) in zip(axes, curves.items(), strict=False):
+        ax.plot(t, values[::every], lw=1.5)
+        ax.set_ylabel(label)
+        ax.axhline(0.0, color="k", lw=0.8, ls="--")
+    share = run.u[::every] / problem.model.u_max
+    for i, name in enumerate(problem.model.joint_names):
+        axes[3].plot(t, share[:, i], lw=1.2, label=name)
+    for side in (-1.0, 1.0):
+        axes[3].axhline(side, color="k", lw=0.8, ls="--")
+    axes[3].set_ylabel("torque / limit")
+    axes[3].set_xlabel("time [s]")
+    axes[3].legend(fontsize=8, ncols=4, loc="upper right")
+    active = run.active.astype(bool)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]])))
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        for first, end in zip(edges[::2], edges[1::2], strict=True):
+            ax.axvspan(run.t[first], run.t[end - 1], color="C1", alpha=0.12, lw=0)
+    save_figure(fig, path)
 
 
 def plot_paths(problem: Problem, runs: Mapping[str, Trajectory], path: Path) -> None:

@@ -18,7 +18,7 @@ from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_domain, derive_gains
 from ppcbf_robots.derive_body import Body, derive_body
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.network import NumpyNetwork
-from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world
+from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world, is_file
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.self_collision import self_pairs
@@ -139,7 +139,9 @@ def load_robot(name: str) -> Robot:
     else:
         spec, urdf = RobotSpec(urdf=str(path)), path
     dirs = [(path.parent / d).resolve() for d in spec.package_dirs] + default_package_dirs(urdf)
-    model = RobotModel(urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload, spec.moving, spec.position)
+    model = RobotModel(
+        urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload, spec.moving, spec.position, spec.effort_rate
+    )
     model.warnings += [spec.note] if spec.note else []
     domain = derive_domain(model, spec.domain)
     model.check_mass_matrix(domain.sample_q(np.random.default_rng(SAMPLE_SEED), 100))
@@ -171,9 +173,11 @@ def load_problem(robot: str, world: str) -> Problem:
 
 def _spec_urdf(path: Path, spec: RobotSpec) -> Path:
     """The URDF of a spec: relative to the spec's folder, else a name in example-robot-data."""
-    found = path.parent / spec.urdf if (path.parent / spec.urdf).is_file() else find_example(spec.urdf)
+    found = path.parent / spec.urdf if is_file(path.parent / spec.urdf) else find_example(spec.urdf)
     if found is None:
-        raise InputError(f"{path}: urdf: neither the file {path.parent / spec.urdf} nor a URDF of example-robot-data")
+        raise InputError(
+            f"{path}: urdf: neither the file {str(path.parent / spec.urdf)[:300]} nor a URDF of example-robot-data"
+        )
     return found
 
 

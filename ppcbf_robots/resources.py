@@ -14,6 +14,14 @@ ALIASES = {"baxter": "baxter_left", "tiago_no_hand": "tiago_arm"}
 """Robots of example-robot-data that have more than an arm, and the bundled spec of one arm that their name gives."""
 
 
+def is_file(path: Path) -> bool:
+    """Whether a path leads to a file: not to a folder, pipe or device, and not what no path can be."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long, not permitted
+        return False
+
+
 def bundled(folder: str, suffix: str = ".yaml") -> dict[str, Path]:
     """Bundled files by name; ``folder`` is 'robots' or 'obstacles'."""
     root = Path(str(files(f"ppcbf_robots.{folder}")))
@@ -28,7 +36,7 @@ def find_robot(name: str) -> Path:
     """
     path = Path(name)
     if path.suffix in (".yaml", ".yml", ".urdf", ".xml"):
-        if path.is_file():
+        if is_file(path):
             return path
         raise InputError(f"robot file not found: {path}")
     specs = bundled("robots")
@@ -54,7 +62,7 @@ def find_world(name: str) -> Path:
     """Path of a world: a file as given, or a bundled name; InputError if neither."""
     path = Path(name)
     if path.suffix.lower() in (*YAML_SUFFIXES, *WORLD_SUFFIXES):
-        if path.is_file():
+        if is_file(path):
             return path
         raise InputError(f"obstacle file not found: {path}")
     worlds = bundled("obstacles")
@@ -67,7 +75,7 @@ def find_world(name: str) -> Path:
 
 def portable(name: str) -> str:
     """A robot or world by a name that holds in any folder: paths become absolute."""
-    return str(Path(name).resolve()) if Path(name).is_file() else name
+    return str(Path(name).resolve()) if is_file(Path(name)) else name
 
 
 def _example_urdfs() -> dict[str, Path]:

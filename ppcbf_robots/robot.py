@@ -7,6 +7,7 @@ the base frame. Every array of an evaluation may carry a leading batch axis.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits
+from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits, rate_limits
 from ppcbf_robots.kernels import mirror, points_at
 from ppcbf_robots.meshes import Meshes
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, vector
@@ -99,6 +100,7 @@ class RobotModel:
         effort: torque limits, overriding the URDF's [N m | N].
         velocity: velocity limits, overriding the URDF's [rad/s | m/s].
         position: position limits by joint, overriding the URDF's [rad | m].
+        effort_rate: how fast torques may change [N m/s | N/s]; joints without one are not limited.
         payload: a point mass added to a frame.
 
     Raises:
@@ -115,6 +117,7 @@ class RobotModel:
         payload: PayloadSpec | None = None,
         moving: Sequence[str] | None = None,
         position: Mapping[str, tuple[float, float]] | None = None,
+        effort_rate: PerJoint | None = None,
     ) -> None:
         self.urdf = Path(urdf)
         self.package_dirs = [Path(p) for p in package_dirs]
@@ -133,16 +136,26 @@ class RobotModel:
         self.model = lock(self.full_model, self.locked)[0]
         self.joint_names = list(self.model.names)[1:]
         if payload is not None:
-            self._add_payload(payload)
+            self.add_payload(payload)
         self.data = self.model.createData()
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
+        self.friction = np.zeros(self.nv)  # Coulomb [N m | N], of a plant alone: `evaluate` and the filter know none
         self._oMi = _strided(self.data.oMi)
         self._index_joints()
         names = self.joint_names
         self.u_max, self.v_max = force_limits(self.urdf, names, facts.joints, effort, velocity)
+        self.u_rate = rate_limits(self.urdf, names, effort_rate)
         self.q_lower, self.q_upper = position_limits(self.urdf, names, facts.joints, position or {}, self.warnings)
 
-    def _add_payload(self, payload: PayloadSpec) -> None:
+    def with_model(self, model: pin.Model) -> RobotModel:
+        """This robot on another Pinocchio model of the same joints and frames."""
+        other = copy.copy(self)
+        other.model, other.data = model, model.createData()
+        other._oMi = _strided(other.data.oMi)
+        return other
+
+    def add_payload(self, payload: PayloadSpec) -> None:
+        """Add a point mass to a frame; InputError if there is none by that name."""
         frame = self.model.frames[self.frame_id(payload.frame)]
         if payload.mass > 0.0:
             inertia = pin.Inertia(payload.mass, np.asarray(payload.com, float), np.zeros((3, 3)))

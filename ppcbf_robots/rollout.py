@@ -6,12 +6,13 @@ import dataclasses
 import json
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ppcbf_robots.controllers import NominalController
 from ppcbf_robots.ending import GOAL_TOLERANCE, Ending, judge
@@ -25,6 +26,7 @@ from ppcbf_robots.specs import Array
 
 RK4_STEP = 5e-4  # [s], the paper's T_s
 NEAR = 0.05  # [m], clearance below which an arm counts as passing an obstacle
+FASTEST = 1e4  # [rad/s | m/s], above which a run counts as diverged
 V_FLOOR = 0.01  # [J], least storage that energy rises are compared with
 
 
@@ -58,10 +60,9 @@ class Trajectory:
     @staticmethod
     def load(path: Path) -> Trajectory:
         """Read an .npz written by :meth:`save`; InputError if it is not one."""
-        names = [f for f in Trajectory.__dataclass_fields__ if f != "meta"]
         try:
             with np.load(path, allow_pickle=False) as file:
-                data = {k: file[k] for k in names}
+                data = {k: file[k] for k in FIELDS}
                 meta = json.loads(str(file["meta"]))
         except FileNotFoundError:
             raise InputError(f"trajectory not found: {path}") from None
@@ -80,10 +81,13 @@ class Trajectory:
         error = float(np.max(np.abs(model.difference(self.q[-1], goal))))
         end = self.ending()
         contacts = self.meta.get("contacts")  # absent in files of version 0.1.0
+        rates = self._rate_ratios(model)
         return {
             "min_h": float(self.h.min()),
             "clearance": float(self.clearance.min()),
             "max_torque_ratio": float(np.max(np.abs(self.u) / model.u_max)),
+            "max_rate_ratio": None if rates is None else float(rates.max(initial=0.0)),
+            "rate_violations": None if rates is None else int(np.sum(rates > 1.0 + 1e-9)),
             "energy_rise": rise / V0,
             "injected": float(np.maximum(np.diff(self.V), 0.0).sum()),
             "reached_goal": error < GOAL_TOLERANCE,
@@ -99,6 +103,14 @@ class Trajectory:
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
 
+    def _rate_ratios(self, model: RobotModel) -> Array | None:
+        """Largest ``|u̇_i| / u_rate_i`` of each step (T - 1,), 0 to and from a STOP; None without rate limits."""
+        if not np.any(np.isfinite(model.u_rate)):
+            return None
+        ratios = np.max(np.abs(np.diff(self.u, axis=0)) / (np.diff(self.t)[:, None] * model.u_rate), axis=1)
+        stopped = self.status == Status.STOP
+        return np.asarray(np.where(stopped[1:] | stopped[:-1], 0.0, ratios))
+
     def ending(self) -> Ending | None:
         """How the run ended; None if it diverged, or in files of version 0.2.0."""
         end = self.meta.get("end")
@@ -108,6 +120,9 @@ class Trajectory:
         """Time [s] after which the clearance stays above 5 cm; None if it never fell below, or never rose again."""
         near = np.flatnonzero(self.clearance <= NEAR)
         return float(self.t[near[-1] + 1]) if near.size and near[-1] + 1 < len(self.t) else None
+
+
+FIELDS = [name for name in Trajectory.__dataclass_fields__ if name != "meta"]
 
 
 def simulate(
@@ -159,17 +174,39 @@ def simulate(
         clearance = float(rows.h[: safety.pairs].min())
         record.append((t, q, v, last.u, nominal.u, float(rows.h.min()), clearance, last.phi, float(nominal.V),
                        last.status != Status.FREE, int(last.status)))  # fmt: skip
-        if not np.all(np.isfinite(last.u)) or not np.all(np.isfinite(v)) or np.abs(v).max() > 1e4:
+        if diverged(last.u, v):
             break
         engine.advance(last.u, RK4_STEP, substeps)
         if on_step is not None and i % 50 == 0:
             on_step(t)
-    names = [f for f in Trajectory.__dataclass_fields__ if f != "meta"]
-    fields: dict[str, Any] = {k: np.array(x) for k, x in zip(names, zip(*record, strict=True), strict=True)}
+    fields: dict[str, Any] = {k: np.array(x) for k, x in zip(FIELDS, zip(*record, strict=True), strict=True)}
     complete = len(record) == steps + 1
-    deciding = last.row if last.status not in (Status.FREE, Status.STOP) else ""
     touches = [f"{c.link} / {c.obstacle}" for c in touching or ()]
-    end = dataclasses.asdict(judge(fields, controller.goal, safety, deciding, touches)) if complete else None
-    extra = {"goal": controller.goal.tolist(), "end": end, "complete": complete, "engine": engine.name,
-             "contacts": touched.report()}  # fmt: skip
-    return Trajectory(**fields, meta={**(meta or {}), **extra})
+    extra = {"engine": engine.name, "contacts": touched.report()}
+    return ended(fields, {**(meta or {}), **extra}, controller.goal, safety, last.row, touches, complete)
+
+
+def diverged(u: Array, v: Array) -> NDArray[np.bool_]:
+    """Whether a run ends here, (...): u and v (..., nv)."""
+    lost = ~np.isfinite(u).all(axis=-1) | ~np.isfinite(v).all(axis=-1) | (np.abs(v) > FASTEST).any(axis=-1)
+    return np.asarray(lost)
+
+
+def ended(
+    fields: dict[str, Any], meta: dict[str, Any], goal: Array, safety: SafetyFunction, row: str,
+    touches: Sequence[str], complete: bool,
+) -> Trajectory:  # fmt: skip
+    """A record as a trajectory that says how it ends.
+
+    Args:
+        fields: arrays of :class:`Trajectory`, without meta.
+        meta: of the caller.
+        goal: (nq,).
+        safety: the safety function of the run.
+        row: that decided the last control step, "" if none.
+        touches: contacts of the last state, "link / obstacle".
+        complete: whether the run went on to its planned end.
+    """
+    deciding = row if Status(int(fields["status"][-1])) not in (Status.FREE, Status.STOP) else ""
+    end = dataclasses.asdict(judge(fields, goal, safety, deciding, touches)) if complete else None
+    return Trajectory(**fields, meta={**meta, "goal": goal.tolist(), "end": end, "complete": complete})

@@ -115,7 +115,7 @@ def check_boundary(
         for i in np.flatnonzero(near)[: count - samples]:
             at = problem.model.evaluate(q[i], v[i])
             u_des = problem.robot.controller.evaluate(at).u
-            infeasible += runtime.filter(0.0, at, u_des, None).status >= Status.PASSIVITY_DROPPED
+            infeasible += runtime.filter(at, u_des, None).status >= Status.PASSIVITY_DROPPED
             samples += 1
         if samples == count:
             break

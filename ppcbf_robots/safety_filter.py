@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ppcbf_robots.barriers import Barrier, RhoBarrier
+from ppcbf_robots.barriers import Barrier, BarrierRows, RhoBarrier
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, is_slow
+from ppcbf_robots.filters import Box, ClosedForm, Correction, FilterConfig, QPFilter, Status, is_slow
 from ppcbf_robots.robot import Dynamics, RobotModel
-from ppcbf_robots.safety import SafetyFunction
+from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.shapes import Motion, Packed
+from ppcbf_robots.slip import SlipBatch, SlipObserver
 from ppcbf_robots.specs import Array
+from ppcbf_robots.state_check import StateCheck, is_finite_number
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +39,21 @@ class StepResult:
     port_power: float = 0.0  # [W] beyond d_p that a moving obstacle puts in through the arm's evasion
 
 
+@dataclass(frozen=True)
+class Screen:
+    """What is known of a batch of states before any QP is solved."""
+
+    free: NDArray[np.bool_]  # (B,) u_des needs no correction
+    safety: SafetyRows
+    rows: BarrierRows
+    wary: BarrierRows  # lowered by the slip of phi, or the same rows
+
+    def at(self, i: int) -> tuple[SafetyRows, BarrierRows, BarrierRows]:
+        """The rows of one state."""
+        rows, wary = (BarrierRows(*(x[i] for x in vars(r).values())) for r in (self.rows, self.wary))
+        return SafetyRows(*(x[i] for x in vars(self.safety).values())), rows, rows if self.wary is self.rows else wary
+
+
 class SafetyFilter:
     """Corrects a desired torque as little as its metric allows so that every row of the barrier holds.
 
@@ -46,6 +64,12 @@ class SafetyFilter:
         config: filter settings.
         damping: K_d (nv,) of the fallback torque ``sat(g - K_d v)``; by default 1 % of u_max per v_max.
         gravity_included: False if u_des leaves gravity out and the returned torque must too (libfranka).
+        rate: how fast the returned torque may change, one number or (nv,) [N m/s | N/s]; by default the robot's
+            ``u_rate``, infinite for none. One control period ``config.dt`` counts per step, however late it comes.
+
+    Where the rate is limited, every returned torque but STOP's zero lies within ``rate dt`` of the last one, and inside
+    the box. Before the first step and after :meth:`reset` the last one is taken to be the gravity torque (zero without
+    ``gravity_included``), that of an arm held at rest; give ``u_last`` if it is another.
 
     The filter keeps counts of every status in ``counts`` and logs each step down its ladder with the reason. Python is
     not a safety-rated function: keep the robot's own monitored limits on.
@@ -59,25 +83,48 @@ class SafetyFilter:
         config: FilterConfig | None = None,
         damping: Array | None = None,
         gravity_included: bool = True,
+        rate: ArrayLike | None = None,
     ) -> None:
         self.robot, self.safety, self.barrier = robot, safety, barrier
         self.config = config or FilterConfig()
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
         closed = self.config.kind == "closed-form"
-        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config)
+        limit = self._rate(rate)
+        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config, limit)
         learned = isinstance(barrier, RhoBarrier)
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
         self._last_status = Status.FREE
-        self._last: tuple[float, Array] | None = None  # (time, gravity torque) of the last valid state
+        config = self.config
+        self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
+        self._last_g: Array | None = None  # gravity torque of the last valid state
         self._invalid_steps = 0  # in a row
+        self._step_limit = limit * config.dt
+        self._rate_limited = bool(np.isfinite(self._step_limit).any())
+        self._sent: deque[Array] = deque(maxlen=math.ceil(config.max_age / config.dt) + 1)  # torques as returned
+        watched = not closed and learned and math.isfinite(config.slip_time)
+        self._slip = SlipObserver(config.dt, config.slip_time) if watched else None
+        self._moved = False  # whether obstacles were elsewhere in the last step
         if self.damping.shape != (robot.nv,) or not np.all(np.isfinite(self.damping) & (self.damping >= 0.0)):
             raise InputError(f"damping: expected {robot.nv} finite numbers of at least 0, got {self.damping.tolist()}")
 
     def reset(self) -> None:
-        """Forget the last state, for a clock that starts anew."""
-        self._last, self._invalid_steps = None, 0
+        """Forget the last state and torque, for a clock that starts anew or an arm that was moved by other means."""
+        self._check.reset()
+        self._last_g, self._invalid_steps = None, 0
+        self._sent.clear()
+        if self._slip is not None:
+            self._slip.reset()
+
+    def _rate(self, rate: ArrayLike | None) -> Array:
+        try:
+            rates = np.array(np.broadcast_to(self.robot.u_rate if rate is None else rate, (self.robot.nv,)), float)
+        except (TypeError, ValueError):
+            rates = np.zeros(self.robot.nv)
+        if not np.all(rates > 0.0):
+            raise InputError(f"rate: expected one positive number or {self.robot.nv}, got {rate!r}")
+        return rates
 
     def step(
         self,
@@ -87,6 +134,8 @@ class SafetyFilter:
         u_des: ArrayLike,
         d_p: float | None = None,
         motions: Mapping[str, Motion] | None = None,
+        u_last: ArrayLike | None = None,
+        age: float = 0.0,
     ) -> StepResult:
         """One control step.
 
@@ -100,40 +149,127 @@ class SafetyFilter:
             motions: obstacles, by name, that are elsewhere than in the world's file or moving. K_theta was not trained
                 for that: while any is given, the filter runs on the LB-CBF (K = 0). Where one comes closer, the
                 passivity row yields to it, and what that puts in is ``port_power``. An unknown name or NaN is a FAULT.
+            u_last: torque (nv,) in force until now, commanded or measured, in the convention of u_des; only a limited
+                rate looks at it. None: the torque that the last step returned. NaN is a FAULT.
+            age: how old the state is [s], if the caller knows; the filter predicts it to now with the torques returned
+                since. Older than ``config.max_age`` it is invalid.
 
         Returns:
-            A finite torque, inside the box unless the filter is the closed form, and its status.
+            A finite torque and its status. It lies inside the box unless the filter is the closed form without a rate
+            limit, and keeps the rate.
         """
         q, v, u_des = (_numbers(x) for x in (q, v, u_des))
-        problem = self._invalid(t, q, v)
+        problem = self._check.problem(t, q, v, age)
+        unknown = "" if u_last is None else self._tell(u_last)
         if problem:
             self._invalid_steps += 1
             return self._count(self._hold(t, problem))
-        dyn = self.robot.evaluate(q, v)
+        self._check.accept(t, q.copy(), v.copy())
+        dyn = self.robot.evaluate(*(self._predict(q, v, age) if age > 0.0 else (q, v)))
+        self._last_g, self._invalid_steps = dyn.g, 0
+        allowed = self._allowed(dyn.g)
         try:
             obstacles = self.safety.packed.moved(motions) if motions else None
         except InputError as error:
-            self._remember(t, dyn)
-            return self._count(self._fault(dyn, str(error)))
-        return self._count(self.filter(t, dyn, u_des, d_p, obstacles))
+            unknown = str(error)
+        if unknown:
+            return self._count(self._fault(dyn, unknown, allowed=allowed))
+        return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed, t))
+
+    def _predict(self, q: Array, v: Array, age: float) -> tuple[Array, Array]:
+        """The state ``age`` [s] later under the torques returned since, before the first of them gravity's."""
+        dt = self.config.dt
+        periods, rest = divmod(age, dt)
+        pieces = [dt] * int(periods) + [rest]
+        q_now, v_now = q, v
+        for i, piece in enumerate(reversed(pieces)):
+            behind = len(pieces) - i  # periods ago
+            u = self._sent[-behind] if behind <= len(self._sent) else None
+            if u is None or not self.gravity_included:
+                u = self.robot.gravity(q_now) + (0.0 if u is None else u)
+            v_now = v_now + piece * self.robot.acceleration(q_now, v_now, u)
+            q_now = self.robot.integrate(q_now, piece * v_now)
+        usable = bool(np.isfinite(q_now).all() and np.isfinite(v_now).all())
+        return (q_now, v_now) if usable else (q, v)
+
+    def _tell(self, u_last: ArrayLike) -> str:
+        """Take over the caller's last torque; in words why not, if it cannot be used."""
+        u = _numbers(u_last)
+        if u.shape != (self.robot.nv,) or not np.isfinite(u).all():
+            return f"u_last is not {self.robot.nv} finite numbers"
+        if self._sent:
+            self._sent.pop()
+        self._sent.append(u)
+        return ""
+
+    def _allowed(self, g: Array) -> Box | None:
+        """Torques, gravity included, that box and rate allow after the last one; None if the rate is not limited.
+
+        The box comes first where a last torque outside it leaves no other.
+        """
+        if not self._rate_limited:
+            return None
+        u_max, offset = self.robot.u_max, 0.0 if self.gravity_included else g
+        last = self._sent[-1] + offset if self._sent else np.clip(g, -u_max, u_max)
+        return np.clip(last - self._step_limit, -u_max, u_max), np.clip(last + self._step_limit, -u_max, u_max)
 
     def filter(
-        self, t: float, dyn: Dynamics, u_des: Array, d_p: float | None, obstacles: Packed | None = None
+        self,
+        dyn: Dynamics,
+        u_des: Array,
+        d_p: float | None,
+        obstacles: Packed | None = None,
+        allowed: Box | None = None,
+        t: float | None = None,
     ) -> StepResult:
-        """The step for a state that was already evaluated (and checked), with the obstacles where they are now."""
-        self._remember(t, dyn)
+        """The step for a valid state, with the obstacles where they are now.
+
+        ``allowed`` are the bounds of the torque, gravity included, where they are tighter than the box. Without ``t``
+        the state stands on its own: nothing is learned from it of the slip of phi.
+        """
         safety = self.safety.evaluate(dyn, obstacles)
+        if self._slip is not None and t is not None and self._moved != (obstacles is not None):
+            self._moved = obstacles is not None
+            self._slip.forget_step()  # another barrier
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
+        if not self._usable(rows, u_des, d_p):
+            reason, h, phi = "u_des, d_p or the barrier is not finite", float(rows.h.min()), float(rows.phi.min())
+            return self._fault(dyn, reason, h, phi, allowed=allowed)
+        if self._slip is None or t is None:
+            return self._answer(dyn, safety, rows, rows, u_des, d_p, obstacles is not None, allowed)
+        wary = self._slip.wary(t, rows)
+        result = self._answer(dyn, safety, rows, wary, u_des, d_p, obstacles is not None, allowed)
+        if result.status is not Status.FAULT:
+            self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g)
+        return result
+
+    def _usable(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> bool:
+        wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
+        return wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())
+
+    def _answer(
+        self,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        wary: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        moving: bool,
+        allowed: Box | None,
+    ) -> StepResult:
+        """The step for finite rows.
+
+        ``wary`` are the same rows lowered by the slip of phi; ``moving`` says that they are of obstacles which are not
+        where the file has them.
+        """
         offset = 0.0 if self.gravity_included else dyn.g
         h, phi = float(rows.h.min()), float(rows.phi.min())
-        wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
-        if not (wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())):
-            return self._fault(dyn, "u_des, d_p or the barrier is not finite", h, phi)
-        pushed = obstacles is not None and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
+        pushed = moving and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
-        c = self.correction.correct(dyn, safety, rows, u_des + offset, budget, self.robot.u_max)
+        c = self._correct(dyn, safety, rows, wary, u_des + offset, budget, allowed)
         if c.status is Status.FAULT:
-            return self._fault(dyn, c.reason, h, phi, self._name(c.row))
+            return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
         status = c.status
         if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
             status = Status.RESTING
@@ -141,13 +277,57 @@ class SafetyFilter:
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
 
-    def _remember(self, t: float, dyn: Dynamics) -> None:
-        """This state is valid: what an invalid one after it is bridged with."""
-        self._last, self._invalid_steps = (t, dyn.g), 0
+    def _correct(
+        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, wary: BarrierRows, u_des: Array, d_p: float | None,
+        allowed: Box | None,
+    ) -> Correction:  # fmt: skip
+        """The correction that makes up for the slip of phi, or where that is too much to ask, the one that does not."""
+        u_max = self.robot.u_max
+        c = self.correction.correct(dyn, safety, wary, u_des, d_p, u_max, allowed)
+        if wary is not rows and c.status >= Status.PASSIVITY_DROPPED:
+            plain = self.correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
+            c = plain if plain.status < c.status else c
+        return c
 
-    def _fault(self, dyn: Dynamics, reason: str, h: float = np.nan, phi: float = np.nan, row: str = "") -> StepResult:
-        """``sat(g - K_d v)`` for a valid state without a usable answer: kinetic energy cannot grow under it."""
-        u = np.clip(dyn.g - self.damping * dyn.v, -self.robot.u_max, self.robot.u_max)
+    def slips(self, count: int) -> SlipBatch | None:
+        """What is learned of the slip of phi in so many runs, for :meth:`screen`; None if this filter does not look."""
+        return None if self._slip is None else SlipBatch(self._slip.dt, self._slip.time, count)
+
+    def screen(self, dyn: Dynamics, u_des: Array, t: float = 0.0, slips: SlipBatch | None = None) -> Screen:
+        """The rows of a batch of valid states at time t, and at which of them the filter leaves u_des (B, nv) as it is.
+
+        At the others, and at all where the rate is limited, :meth:`step_screened` has to be asked.
+        """
+        safety = self.safety.evaluate(dyn)
+        rows = self.barrier.rows(dyn, safety)
+        wary = rows if slips is None else slips.wary(t, rows)
+        total = u_des if self.gravity_included else u_des + dyn.g
+        free = self.correction.passes(dyn, wary, total, self.robot.u_max) & (not self._rate_limited)
+        return Screen(free, safety, rows, wary)
+
+    def step_screened(self, dyn: Dynamics, screen: Screen, i: int, u_des: Array, d_p: float | None) -> StepResult:
+        """The step for a valid state ``dyn``, number i of a screened batch, after the last one that this filter saw."""
+        safety, rows, wary = screen.at(i)
+        allowed = self._allowed(dyn.g)
+        if not self._usable(rows, u_des, d_p):
+            reason = "u_des, d_p or the barrier is not finite"
+            return self._count(self._fault(dyn, reason, float(rows.h.min()), float(rows.phi.min()), allowed=allowed))
+        return self._count(self._answer(dyn, safety, rows, wary, u_des, d_p, False, allowed))
+
+    def _fault(
+        self,
+        dyn: Dynamics,
+        reason: str,
+        h: float = np.nan,
+        phi: float = np.nan,
+        row: str = "",
+        allowed: Box | None = None,
+    ) -> StepResult:
+        """``sat(g - K_d v)`` for a valid state without a usable answer: kinetic energy cannot grow under it.
+
+        With a limited rate it is approached at that rate, and may grow on the way.
+        """
+        u = np.clip(dyn.g - self.damping * dyn.v, *(allowed or (-self.robot.u_max, self.robot.u_max)))
         return StepResult(u if self.gravity_included else u - dyn.g, Status.FAULT, reason, h, phi, row)
 
     def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
@@ -157,36 +337,26 @@ class SafetyFilter:
     def _name(self, row: int) -> str:
         return self.safety.names[row] if row >= 0 else ""
 
-    def _invalid(self, t: float, q: Array, v: Array) -> str:
-        if q.shape != (self.robot.nq,) or v.shape != (self.robot.nv,):
-            return f"state of shape {q.shape}, {v.shape} instead of ({self.robot.nq},), ({self.robot.nv},)"
-        if not isinstance(t, int | float | np.number) or not np.isfinite(t):
-            return "time not a finite number"
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            return "state not finite"
-        c = self.robot.idx_q[self.robot.continuous]
-        if len(c) and np.any(np.abs(q[c] ** 2 + q[c + 1] ** 2 - 1.0) > 1e-2):
-            return "a continuous joint's (cos, sin) is not of length 1"
-        if self._last is not None and t < self._last[0]:
-            return f"time went backwards, from {self._last[0]:g} s to {t:g} s"
-        return ""
-
     def _hold(self, t: float, problem: str) -> StepResult:
-        """Gravity torque of the last valid state for at most max_hold, then STOP with zero torque.
+        """Gravity torque of the last valid state for at most max_hold, approached at a limited rate; then STOP.
 
-        Time is the caller's clock or the count of steps, whichever is longer: the clock may be what failed.
+        STOP is zero torque at once. Time is the caller's clock or the count of steps, whichever is longer: the clock
+        may be what failed.
         """
         held = self._invalid_steps * self.config.dt
-        if self._last is not None and isinstance(t, int | float | np.number) and np.isfinite(t):
-            held = max(held, t - self._last[0])
-        if self._last is not None and held <= self.config.max_hold:
-            g = np.clip(self._last[1], -self.robot.u_max, self.robot.u_max)
-            u = g if self.gravity_included else np.zeros_like(g)
+        if self._check.last is not None and is_finite_number(t):
+            held = max(held, t - self._check.last[0])
+        if self._last_g is not None and held <= self.config.max_hold:
+            u = np.clip(self._last_g, -self.robot.u_max, self.robot.u_max)
+            u = u if self.gravity_included else np.zeros_like(u)
+            if self._sent:
+                u = np.clip(u, self._sent[-1] - self._step_limit, self._sent[-1] + self._step_limit)
             return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
         return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
 
     def _count(self, result: StepResult) -> StepResult:
         self.counts[result.status] += 1
+        self._sent.append(result.u)
         if result.status is not self._last_status:  # a change, not every tick of a lasting alarm
             level = logging.WARNING if result.status >= Status.PASSIVITY_DROPPED else logging.DEBUG
             log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)

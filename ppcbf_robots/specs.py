@@ -114,6 +114,7 @@ class RobotSpec(Spec):
     locked: dict[str, float] = {}
     effort: PerJoint | None = None
     velocity: PerJoint | None = None
+    effort_rate: PerJoint | None = None  # [N m/s | N/s]: how fast the torque may change; None: at once
     position: dict[str, tuple[float, float]] = {}
     controller: ControllerSpec | None = None
     body: list[BodyPrimitive] | None = None

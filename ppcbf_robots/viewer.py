@@ -58,7 +58,7 @@ def show(
     Raises:
         InputError: if a trajectory does not belong to the problem, or the port cannot be used.
     """
-    server = PageServer(_page(problem, trajectories, labels), port)
+    server = PageServer(page(problem, trajectories, labels), port)
     if open_browser:
         webbrowser.open(server.url)
     return server
@@ -70,10 +70,10 @@ def write_html(problem: Problem, trajectories: Sequence[Trajectory], labels: Seq
     Raises:
         InputError: if a trajectory does not belong to the problem, or the file cannot be written.
     """
-    page = _page(problem, trajectories, labels)
+    text = page(problem, trajectories, labels)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(page, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
@@ -125,7 +125,8 @@ class _View:
     flat: bool  # all motion lies in a plane of constant y
 
 
-def _page(problem: Problem, trajectories: Sequence[Trajectory], labels: Sequence[str]) -> str:
+def page(problem: Problem, trajectories: Sequence[Trajectory], labels: Sequence[str]) -> str:
+    """The view as HTML; InputError if a trajectory does not belong to the problem."""
     check_trajectories(problem, trajectories, labels)
     runs = _runs(problem, trajectories, labels)
     view = _view(problem, runs)

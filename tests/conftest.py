@@ -1,13 +1,23 @@
-"""Robots in their worlds, loaded once, and what several test files need: random states, motions and networks."""
+"""What several test files need: robots in their worlds, loaded once, random states, motions, networks, a browser."""
 
 from __future__ import annotations
 
+import base64
+import io
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import websocket
 from hypothesis import settings
+from PIL import Image
 
 from ppcbf_robots.barriers import Barrier, BarrierKind
 from ppcbf_robots.network import NetworkKind, NumpyNetwork
@@ -136,6 +146,93 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
+    "--window-size=800,600", "--remote-debugging-port=0", "about:blank",
+]  # fmt: skip
+
+
+class Browser:
+    """Headless Chromium with one tab, driven through the DevTools protocol."""
+
+    def __init__(self, profile: Path) -> None:
+        assert CHROMIUM is not None
+        self.process = subprocess.Popen([CHROMIUM, f"--user-data-dir={profile}", *FLAGS], stderr=subprocess.DEVNULL)
+        port_file = profile / "DevToolsActivePort"
+        self.until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
+        port = port_file.read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            tab = next(t for t in json.load(answer) if t["type"] == "page")
+        self.socket = websocket.create_connection(tab["webSocketDebuggerUrl"], timeout=60, suppress_origin=True)
+        self.count = 0
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        for domain in ("Runtime", "Log", "Network", "Page"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        """Result of one command; events that come first are noted."""
+        self.count += 1
+        self.socket.send(json.dumps({"id": self.count, "method": method, "params": params}))
+        while True:
+            message = json.loads(self.socket.recv())
+            if message.get("id") == self.count:
+                assert "error" not in message, message
+                return dict(message["result"])
+            self._note(message["method"], message["params"])
+
+    def _note(self, event: str, params: dict[str, Any]) -> None:
+        if event == "Runtime.exceptionThrown":
+            self.complaints.append(json.dumps(params["exceptionDetails"])[:500])
+        elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
+            self.complaints.append(json.dumps(params["args"])[:500])
+        elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.complaints.append(params["entry"]["text"])
+        elif event == "Network.requestWillBeSent":
+            self.requests.append(params["request"]["url"])
+
+    def open(self, url: str) -> None:
+        """Load a page and wait until it says that it is ready."""
+        self.complaints.clear()
+        self.requests.clear()
+        self.call("Page.navigate", url=url)
+        self.until(lambda: self.evaluate("document.body && document.body.dataset.ready") == "yes")
+
+    def evaluate(self, expression: str) -> Any:
+        """Value of a JavaScript expression in the page."""
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def pixels(self) -> np.ndarray:
+        """Screenshot, (height, width, 3) uint8."""
+        data = self.call("Page.captureScreenshot", format="png")["data"]
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+    @staticmethod
+    def until(condition: Callable[[], Any], limit: float = 60.0) -> None:
+        """Wait for a condition."""
+        end = time.monotonic() + limit
+        while not condition():
+            assert time.monotonic() < end, "waited in vain"
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """End the browser."""
+        self.call("Browser.close")
+        self.process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Headless Chromium."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium, chromium-browser or google-chrome on the PATH")
+    browser = Browser(tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
 
 
 @pytest.fixture(params=BARRIERS)

@@ -252,8 +252,9 @@ def test_simulate_a_trained_barrier(trajectory, barrier):
 def test_simulate_reports_what_the_trajectory_holds(tmp_path, two_link):
     path = tmp_path / "new" / "t.npz"
     found = facts("simulate", "two_link", "circle", "--duration", 0.1, "--rate", 200, "--out", path)
-    assert set(found) == {"min_h", "clearance", "max_torque_ratio", "energy_rise", "injected", "reached_goal",
-                          "goal_error", "cleared_at", "rests_on", "end", "contacts", "hull_contacts", "contact_with",
+    assert set(found) == {"min_h", "clearance", "max_torque_ratio", "max_rate_ratio", "rate_violations", "energy_rise",
+                          "injected", "reached_goal", "goal_error", "cleared_at", "rests_on", "end", "contacts",
+                          "hull_contacts", "contact_with",
                           "filter_counts", "outside_domain", "out"}  # fmt: skip
     with np.load(path) as file:
         assert len(file["t"]) == sum(found["filter_counts"].values()) == 21

@@ -312,7 +312,7 @@ def test_the_margin_is_negative_exactly_where_the_runtime_filter_has_no_answer(
     for i in range(len(q)):
         dyn = model.evaluate(q[i], v[i])
         nominal = problem.robot.controller.evaluate(dyn)
-        result = runtime.filter(0.0, dyn, nominal.u, float(nominal.d_p) if passive else None)
+        result = runtime.filter(dyn, nominal.u, float(nominal.d_p) if passive else None)
         failed[i] = result.status >= Status.PASSIVITY_DROPPED
     clear = margin.abs().numpy() > 1e-5
     assert clear.mean() > 0.95

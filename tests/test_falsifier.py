@@ -58,7 +58,7 @@ def statuses(problem: Problem, q: Any, v: Any, passive: bool = True) -> list[Sta
     for qi, vi in zip(q, v, strict=True):
         dyn = problem.model.evaluate(qi, vi)
         nominal = problem.robot.controller.evaluate(dyn)
-        found.append(runtime.filter(0.0, dyn, nominal.u, float(nominal.d_p) if passive else None).status)
+        found.append(runtime.filter(dyn, nominal.u, float(nominal.d_p) if passive else None).status)
     return found
 
 

@@ -512,7 +512,7 @@ def test_check_band_finds_torques_beyond_the_limits(two_link, weak, config):
     runtime = SafetyFilter(weak.model, weak.safety, barrier, config)
     for q, v in zip(check.bad_q, check.bad_v, strict=True):
         dyn = weak.model.evaluate(q, v)
-        result = runtime.filter(0.0, dyn, weak.robot.controller.evaluate(dyn).u, None)
+        result = runtime.filter(dyn, weak.robot.controller.evaluate(dyn).u, None)
         assert result.status is Status.INFEASIBLE or np.any(np.abs(result.u) > weak.model.u_max)
 
 

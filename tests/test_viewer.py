@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import io
-import json
-import shutil
 import signal
 import socket
 import subprocess
@@ -14,15 +10,12 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import coal
 import numpy as np
 import pytest
-import websocket
-from PIL import Image
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
@@ -35,91 +28,6 @@ from ppcbf_robots.viewer_shapes import drawable
 from ppcbf_robots.world import HalfSpace
 from ppcbf_robots.world_files.load import load_world
 from ppcbf_robots.world_shapes import coal_shape
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
-    "--window-size=800,600", "--remote-debugging-port=0", "about:blank",
-]  # fmt: skip
-
-
-class Browser:
-    """Headless Chromium with one tab, driven through the DevTools protocol."""
-
-    def __init__(self, profile: Path) -> None:
-        assert CHROMIUM is not None
-        self.process = subprocess.Popen([CHROMIUM, f"--user-data-dir={profile}", *FLAGS], stderr=subprocess.DEVNULL)
-        port_file = profile / "DevToolsActivePort"
-        until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
-        port = port_file.read_text().split()[0]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
-            tab = next(t for t in json.load(answer) if t["type"] == "page")
-        self.socket = websocket.create_connection(tab["webSocketDebuggerUrl"], timeout=60, suppress_origin=True)
-        self.count = 0
-        self.complaints: list[str] = []
-        self.requests: list[str] = []
-        for domain in ("Runtime", "Log", "Network", "Page"):
-            self.call(f"{domain}.enable")
-
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Result of one command; events that come first are noted."""
-        self.count += 1
-        self.socket.send(json.dumps({"id": self.count, "method": method, "params": params}))
-        while True:
-            message = json.loads(self.socket.recv())
-            if message.get("id") == self.count:
-                assert "error" not in message, message
-                return dict(message["result"])
-            self._note(message["method"], message["params"])
-
-    def _note(self, event: str, params: dict[str, Any]) -> None:
-        if event == "Runtime.exceptionThrown":
-            self.complaints.append(json.dumps(params["exceptionDetails"])[:500])
-        elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
-            self.complaints.append(json.dumps(params["args"])[:500])
-        elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
-            self.complaints.append(params["entry"]["text"])
-        elif event == "Network.requestWillBeSent":
-            self.requests.append(params["request"]["url"])
-
-    def open(self, url: str) -> None:
-        """Load a page and wait until it says that it is ready."""
-        self.complaints.clear()
-        self.requests.clear()
-        self.call("Page.navigate", url=url)
-        until(lambda: self.evaluate("document.body && document.body.dataset.ready") == "yes")
-
-    def evaluate(self, expression: str) -> Any:
-        """Value of a JavaScript expression in the page."""
-        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
-
-    def pixels(self) -> np.ndarray:
-        """Screenshot, (height, width, 3) uint8."""
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
-
-    def close(self) -> None:
-        """End the browser."""
-        self.call("Browser.close")
-        self.process.wait(20)
-
-
-def until(condition: Any, limit: float = 60.0) -> None:
-    """Wait for a condition."""
-    end = time.monotonic() + limit
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip("no chromium, chromium-browser or google-chrome on the PATH")
-    browser = Browser(tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
 
 
 def run(problem: Problem, filtered: bool, duration: float) -> Trajectory:
@@ -138,18 +46,20 @@ def two_link() -> tuple[Problem, Trajectory]:
     return problem, run(problem, True, 2.0)
 
 
-def seek(browser: Browser, time: float) -> None:
+def seek(browser: Any, time: float) -> None:
     """Stop the playback at a time [s] and wait until that is shown."""
     browser.evaluate(f"viewer.animator.pause(); viewer.animator.time = {time}; viewer.animator.seek({time})")
     clock = "document.getElementById('clock').textContent"
-    until(lambda: browser.evaluate(clock).startswith(f"{time:.2f} ") and not browser.evaluate("viewer.needs_render"))
+    browser.until(
+        lambda: browser.evaluate(clock).startswith(f"{time:.2f} ") and not browser.evaluate("viewer.needs_render")
+    )
 
 
-def check_page(browser: Browser, path: Path, end: float) -> None:
+def check_page(browser: Any, path: Path, end: float) -> None:
     """The page plays: it starts by itself, something is drawn and moves, nothing complains, nothing is fetched."""
     browser.open(path.as_uri())
     seen = browser.evaluate("viewer.animator.time")
-    until(lambda: abs(browser.evaluate("viewer.animator.time") - seen) > 0.2)
+    browser.until(lambda: abs(browser.evaluate("viewer.animator.time") - seen) > 0.2)
     pictures = []
     for t in (0.0, end):
         seek(browser, t)
@@ -161,14 +71,14 @@ def check_page(browser: Browser, path: Path, end: float) -> None:
     assert [u for u in browser.requests if not u.startswith(("file:", "data:", "blob:"))] == []
 
 
-def test_page_of_one_run_plays(browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+def test_page_of_one_run_plays(browser: Any, two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
     problem, trajectory = two_link
     write_html(problem, [trajectory], ["filtered"], tmp_path / "deep" / "run.html")
     check_page(browser, tmp_path / "deep" / "run.html", 2.0)
 
 
 @pytest.mark.slow
-def test_page_of_two_runs_with_meshes_plays(browser: Browser, tmp_path: Path) -> None:
+def test_page_of_two_runs_with_meshes_plays(browser: Any, tmp_path: Path) -> None:
     problem = load_problem("panda", "sphere")
     path = tmp_path / "panda.html"
     label = "</script><script>console.error('injected')</script>/"
@@ -180,9 +90,7 @@ def test_page_of_two_runs_with_meshes_plays(browser: Browser, tmp_path: Path) ->
     ]  # fmt: skip
 
 
-def test_states_are_shown_when_they_happen(
-    browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path
-) -> None:
+def test_states_are_shown_when_they_happen(browser: Any, two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
     problem, trajectory = two_link
     quarter = len(trajectory.t) // 4
     status = np.repeat([Status.FREE, Status.CORRECTING, Status.RESTING, Status.FAULT], quarter)
@@ -200,7 +108,7 @@ def test_states_are_shown_when_they_happen(
 
 
 def test_robot_and_marker_are_where_the_run_was(
-    browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path
+    browser: Any, two_link: tuple[Problem, Trajectory], tmp_path: Path
 ) -> None:
     problem, trajectory = two_link
     write_html(problem, [trajectory], ["a"], tmp_path / "a.html")
@@ -227,7 +135,7 @@ def test_shapes_keep_their_size(shape: coal.ShapeBase) -> None:
 
 
 def test_every_kind_of_obstacle_is_drawn_where_it_stands(
-    browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path
+    browser: Any, two_link: tuple[Problem, Trajectory], tmp_path: Path
 ) -> None:
     problem, trajectory = two_link
     world = load_world(Path(__file__).parent / "data" / "worlds" / "ours.yaml")
@@ -243,7 +151,7 @@ def test_every_kind_of_obstacle_is_drawn_where_it_stands(
             assert browser.evaluate(f"{node}.position.toArray()") == pytest.approx(expected, abs=1e-6)
 
 
-def test_body_spheres_can_be_hidden(browser: Browser, two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+def test_body_spheres_can_be_hidden(browser: Any, two_link: tuple[Problem, Trajectory], tmp_path: Path) -> None:
     problem, trajectory = two_link
     write_html(problem, [trajectory], ["a"], tmp_path / "a.html")
     browser.open((tmp_path / "a.html").as_uri())
@@ -253,7 +161,7 @@ def test_body_spheres_can_be_hidden(browser: Browser, two_link: tuple[Problem, T
     assert browser.evaluate(visible) is False
 
 
-def test_robot_without_readable_meshes_is_drawn_as_bones(browser: Browser, tmp_path: Path) -> None:
+def test_robot_without_readable_meshes_is_drawn_as_bones(browser: Any, tmp_path: Path) -> None:
     inertial = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
     visual = '<visual><geometry><mesh filename="gone.dae"/></geometry></visual>'
     rest = '<origin xyz="0 0 0.4"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="50" velocity="2"/>'

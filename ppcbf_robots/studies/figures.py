@@ -48,16 +48,17 @@ def _gap(value: float | None) -> float:
     return np.nan if value is None else value
 
 
-def plot_curves(histories: Sequence[list[dict[str, Any]]], path: Path) -> None:
+def plot_curves(histories: Sequence[list[dict[str, Any]]], path: Path, columns: int = len(CURVES)) -> None:
     """Loss, critics and volume of all runs over the iterations: each run, their mean and standard deviation."""
-    fig, axes = plt.subplots(1, len(CURVES), figsize=(4 * len(CURVES), 3.6))
-    for ax, (name, label) in zip(axes, CURVES.items(), strict=True):
+    fig, axes = plt.subplots(len(CURVES) // columns, columns, figsize=(4 * columns, 3.6 * len(CURVES) // columns))
+    for ax, (name, label) in zip(axes.flat, CURVES.items(), strict=True):
         found = curve(histories, name)
         ax.plot(found.iteration, found.runs.T, color="C0", lw=0.6, alpha=0.5)
         ax.fill_between(found.iteration, found.mean - found.std, found.mean + found.std, color="C0", alpha=0.2, lw=0)
         ax.plot(found.iteration, found.mean, color="C0", lw=2.0, marker=".")
         ax.set_xlabel("iteration")
         ax.set_title(label, fontsize=10)
+        ax.ticklabel_format(useOffset=False)
         ax.grid(alpha=0.3)
     save_figure(fig, path)
 
