@@ -1,0 +1,108 @@
+"""What was proved or estimated about a trained barrier: ``certificate.json`` beside it, bound to it by hash."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from ppcbf_robots.errors import InputError
+
+NAME = "certificate.json"
+FORMAT = 1
+CERTIFIED = ("proved", "bounded")
+
+Verdict = Literal["proved", "bounded", "refuted", "undecided"]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One condition and how far it is certain.
+
+    ``bound`` depends on the verdict. Of a proof: for ``Lg_phi`` the proved lower bound of |L_g phi|, for ``passivity``
+    and ``feasibility`` an upper bound of the share of the band where they may fail. Of samples: the upper confidence
+    bound of the violation measure.
+    """
+
+    verdict: Verdict
+    statement: str
+    bound: float | None = None
+    confidence: float | None = None  # of a bound that is not proved
+    samples: int | None = None
+    violations: int | None = None  # among the samples, or states known in all
+    worst_margin: float | None = None
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Verdicts on all conditions, and what they are about."""
+
+    verdict: Verdict
+    conditions: dict[str, Condition]
+    subject: dict[str, Any]  # hashes of weights, robot, task and world, constants, filter and goal
+    not_covered: list[str]
+    seconds: float
+    method: Literal["proof", "samples"]
+    details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def certified(self) -> bool:
+        """Whether every condition was proved or bounded."""
+        return self.verdict in CERTIFIED
+
+    def line(self) -> str:
+        """One line for people."""
+        parts = ", ".join(f"{name} {c.verdict}" for name, c in self.conditions.items())
+        return f"{self.verdict} ({parts})"
+
+    def report(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"format": FORMAT, **asdict(self)}
+
+
+def overall(conditions: Mapping[str, Condition]) -> Verdict:
+    """The weakest of the verdicts."""
+    order: tuple[Verdict, ...] = ("refuted", "undecided", "bounded", "proved")
+    return min((c.verdict for c in conditions.values()), key=order.index)
+
+
+def subject(barrier: Mapping[str, Any], margin: float) -> dict[str, Any]:
+    """What a certificate is about, from the contents of ``barrier.json`` and the margin of the filter."""
+    keys = ("kind", "network", "formula", "filter", "fingerprint", "weights_sha256", "goal")
+    return {key: barrier.get(key) for key in keys} | {"margin": margin}
+
+
+def save_certificate(folder: Path, certificate: Certificate) -> Path:
+    """Write it beside the barrier by an atomic rename."""
+    path, temporary = folder / NAME, folder / f".{NAME}.tmp"
+    try:
+        temporary.write_text(json.dumps(certificate.report(), indent=1, allow_nan=False), encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def load_certificate(folder: Path, barrier: Mapping[str, Any]) -> Certificate | None:
+    """The certificate of a barrier folder; None if there is none.
+
+    Raises:
+        InputError: if the file is not a certificate, or one of another barrier.
+    """
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        assert data.pop("format") == FORMAT
+        data["conditions"] = {name: Condition(**c) for name, c in data["conditions"].items()}
+        found = Certificate(**data)
+        assert all(v in get_args(Verdict) for v in (found.verdict, *(c.verdict for c in found.conditions.values())))
+        assert found.verdict == overall(found.conditions)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, AssertionError):
+        raise InputError(f"{path}: not a certificate of this version; run `ppcbf verify {folder}` again") from None
+    if found.subject != subject(barrier, found.subject.get("margin", 0.0)):
+        raise InputError(f"{path}: belongs to another barrier (its hashes differ); run `ppcbf verify {folder}` again")
+    return found
