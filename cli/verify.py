@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,17 +15,18 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ppcbf_robots.artefact import StoredBarrier, load_barrier
-from ppcbf_robots.band_statistics import BandCounts
+from ppcbf_robots.band_tasks import BandJob, attack_tasks, conditions, sample_tasks
 from ppcbf_robots.certificate import Certificate, overall, save_certificate, subject
 from ppcbf_robots.cli.extras import needs
 from ppcbf_robots.cli.output import JsonOption, emit_json, err, out, table
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem
-from ppcbf_robots.specs import Array
-from ppcbf_robots.sweep import Task, run_sweep
+from ppcbf_robots.results_file import Record
+from ppcbf_robots.sweep import run_sweep
 
 Method = Literal["auto", "proof", "samples"]
 COUNTEREXAMPLES = "counterexamples.npz"
+RECORDS = "verify.jsonl"  # of unfinished samples, in the barrier's folder
 NEVER = [
     "states outside X, below phi = 0, or above the band",
     "the rows that keep the velocity domain: the filter gives them up first",
@@ -77,9 +77,9 @@ def verify(
         found = _sample(problem, stored, folder, samples, confidence, seconds, seed, jobs)
     else:
         found = _prove(problem, stored, folder, power, jobs, time_limit)
-    conditions, states, details = found
+    judged, states, details = found
     certificate = Certificate(
-        overall(conditions), conditions, subject(stored.data, stored.filter_config().margin), NEVER,
+        overall(judged), judged, subject(stored.data, stored.filter_config().margin), NEVER,
         round(time.monotonic() - began, 2), "samples" if reason else "proof", details,
     )  # fmt: skip
     path = save_certificate(folder, certificate)
@@ -112,9 +112,7 @@ def _no_proof(problem: Problem, stored: StoredBarrier) -> str:
 Found = tuple[dict[str, Any], list[tuple[str, list[list[float]]]], dict[str, Any]]
 
 
-def _prove(
-    problem: Problem, stored: StoredBarrier, folder: Path, power: float, jobs: int, time_limit: float
-) -> Found:
+def _prove(problem: Problem, stored: StoredBarrier, folder: Path, power: float, jobs: int, time_limit: float) -> Found:
     from ppcbf_robots.proof.prove import Search, prove
 
     with _bar("band decided") as show:
@@ -136,7 +134,27 @@ def _sample(
     problem: Problem, stored: StoredBarrier, folder: Path, samples: int, confidence: float, seconds: float, seed: int,
     jobs: int,
 ) -> Found:  # fmt: skip
-    raise NotImplementedError
+    weights = stored.data["weights_sha256"]
+    job = BandJob(problem.robot.name, problem.world_name, folder.resolve(), weights, seed)
+    attacks = jobs if seconds > 0.0 and stored.filter["kind"] == "qp" else 0
+    tasks = [*attack_tasks(job, attacks, seconds), *sample_tasks(job, samples)]
+    done = 0
+    with _bar("samples") as show:
+
+        def on_record(record: Record) -> None:
+            nonlocal done
+            done += 1
+            show(done / len(tasks), f"{done} of {len(tasks)} tasks")
+
+        records = run_sweep(tasks, folder / RECORDS, jobs, on_record=on_record)
+    failed = [record["error"] for record in records if "error" in record]
+    if failed:
+        raise CheckFailed(f"{len(failed)} of {len(tasks)} tasks ended with an error; the first: {failed[0]}")
+    found, states, details = conditions(stored, records, confidence)
+    if not attacks:
+        details["no_attack"] = "the attack knows the QP filter alone" if seconds > 0.0 else "--seconds 0"
+    (folder / RECORDS).unlink()
+    return found, list(states.items()), details
 
 
 @contextmanager

@@ -34,21 +34,21 @@ def radius(a: Any) -> float:
     total = a[-1]
     for i in range(1, len(a) - 1):
         total += abs(a[i])
-    return total * UP + TINY
+    return float(total * UP + TINY)
 
 
 @exact_kernel
 def low(a: Any) -> float:
     """A lower bound."""
     r = radius(a)
-    return a[0] - r - ROUNDING * (abs(a[0]) + r)
+    return float(a[0] - r - ROUNDING * (abs(a[0]) + r))
 
 
 @exact_kernel
 def high(a: Any) -> float:
     """An upper bound."""
     r = radius(a)
-    return a[0] + r + ROUNDING * (abs(a[0]) + r)
+    return float(a[0] + r + ROUNDING * (abs(a[0]) + r))
 
 
 @exact_kernel

@@ -1,6 +1,6 @@
 """What a row of the filter is made of, apart from K_theta, as a list of operations that affine forms can follow.
 
-The formulas are CasADi's: articulated-body dynamics and distances of :mod:`ppcbf_robots.symbolic`, and their derivatives.
+The formulas are CasADi's: dynamics and distances of :mod:`ppcbf_robots.symbolic`, and their derivatives.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def rest_torque(controller: NominalController, angles: Any, gravity: Any) -> Any
         if robot.continuous[i]:
             force.append(min(kp, f_max) * ca.sin(e[i]))
         elif gains.kind == "bounded_spring":
-            force.append(kp * e[i] / ca.sqrt(1.0 + ca.sq(kp / f_max * e[i])))
+            force.append(kp * e[i] / ca.sqrt(1.0 + (kp / f_max * e[i]) ** 2))
         else:
             force.append(kp * e[i])
     spring = ca.vertcat(*force)
@@ -111,7 +111,9 @@ def compiled(function: Any) -> Program:
     for k in range(count):
         operation = numbers.get(function.instruction_id(k))
         if operation is None:
-            raise InputError(f"the model holds an operation without affine form (CasADi's {function.instruction_id(k)})")
+            raise InputError(
+                f"the model holds an operation without affine form (CasADi's {function.instruction_id(k)})"
+            )
         out, read = function.instruction_output(k), function.instruction_input(k)
         if operation == _CONST:
             constants[k] = function.instruction_constant(k)

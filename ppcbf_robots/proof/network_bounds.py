@@ -70,7 +70,7 @@ def _layer(x: Any, weights: Any, bias: Any) -> Any:
 
 @exact_kernel
 def _features(q: Any, net: Any) -> Any:
-    """Inputs of the layers and their derivatives by the joints, (1 + joints, S + 2, 3 nq), of forms q (joints, S + 2)."""
+    """Inputs of the layers and derivatives by the joints, (1 + joints, S + 2, 3 nq), of forms q (joints, S + 2)."""
     shift, scale, turns, kinds, joint_of = net[4], net[5], net[6], net[7], net[8]
     joints, planes = q.shape
     nq = len(shift)

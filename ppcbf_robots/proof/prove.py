@@ -166,7 +166,7 @@ def _conditions(
         beyond = f" + {power:g} W" if power else ""
         conditions["passivity"] = Condition(
             _verdict(failed, complete),
-            f"such a torque also satisfies v·(u - u_des) <= d_p{beyond}, but for speeds below the filter's threshold of "
+            f"such a torque also satisfies v·(u - u_des) <= d_p{beyond}, above the speed that the filter counts as "
             f"rest, {on_band}",
             bound=min(1.0, share) if search.done else 1.0,
             violations=failed,
