@@ -43,7 +43,7 @@ class BandCounts:
 def clopper_pearson(violations: int, samples: int, confidence: float) -> float:
     """Upper bound of a probability that holds with ``confidence``, after so many hits in independent samples.
 
-    Clopper & Pearson, *Biometrika* 26 (1934), one-sided: the p with ``P(at most violations hits | p) = 1 - confidence``.
+    Clopper & Pearson, *Biometrika* 26 (1934), one-sided: where so few hits or fewer have probability 1 - confidence.
     """
     if violations >= samples:
         return 1.0

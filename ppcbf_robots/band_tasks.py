@@ -108,13 +108,14 @@ def conditions(
             margins += [] if margin is None else [margin]
         (attacked if is_attack else drawn).add(BandCounts(**result))
     worst = min(margins, default=None)
+    judged = "passivity" if stored.kind == "pp-ncbf" else "feasibility"  # what the attack's margin is about
     found, states = {}, {}
     for name in CONDITIONS:
         if name == "passivity" and stored.kind != "pp-ncbf":
             continue
         bad = drawn.violations[name] + attacked.violations[name]
         p = clopper_pearson(drawn.violations[name], drawn.samples, confidence)
-        unclear = name == "feasibility" and worst is not None and worst < 0.0 and not any(attacked.violations.values())
+        unclear = name == judged and worst is not None and worst < 0.0 and not any(attacked.violations.values())
         verdict: Verdict = "refuted" if bad else "undecided" if unclear else "bounded"
         said = (
             f"{STATEMENTS[name]}: on the band, violation measure <= {p:.3g} with {100 * confidence:g} % confidence"
@@ -124,7 +125,7 @@ def conditions(
                 else ""
             )
         )
-        margin = worst if name == "feasibility" else None
+        margin = worst if name == judged else None
         found[name] = Condition(verdict, said, p, confidence, drawn.samples, drawn.violations[name], margin)
         states[name] = drawn.states[name] + attacked.states[name]
     band = drawn.samples / drawn.tried if drawn.tried else 0.0

@@ -206,12 +206,11 @@ def elu_slope(a: Any, out: Any) -> None:
         end = math.exp(lo) - s * lo
         tangent = s - s * math.log(s) if s > 0.0 and lo < math.log(s) else end
         bottom, top = min(tangent, end, 1.0 - s * hi), max(1.0, end)
-        n = len(a) - 1
-        r = a[n]
+        n, x, r = len(a) - 1, a[0], a[-1]
         for i in range(1, n):
             out[i] = s * a[i]
-        out[0] = s * a[0] + 0.5 * (top + bottom)
-        out[n] = (s * r + 0.5 * (top - bottom) + ROUNDING * (2.0 + s * (hi - lo) + abs(s * a[0]))) * UP + TINY
+        out[0] = s * x + 0.5 * (top + bottom)
+        out[n] = (s * r + 0.5 * (top - bottom) + ROUNDING * (2.0 + s * (hi - lo) + abs(s * x))) * UP + TINY
 
 
 @exact_kernel

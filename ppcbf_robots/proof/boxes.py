@@ -173,10 +173,11 @@ def _decide(
 
     binding, count = np.empty(rows + 1, np.int64), 0  # constraints that some torque in the box breaks
     for k in range(counted):
-        reach = affine.low(A[k])
+        reach, sizes = affine.low(A[k]), abs(affine.low(A[k]))
         for j in range(nv):
-            reach -= max(abs(affine.low(B[k, j])), abs(affine.high(B[k, j]))) * u_max[j] * affine.UP
-        if not reach * (1.0 - 1e-12) - affine.TINY >= 0.0:
+            most = max(abs(affine.low(B[k, j])), abs(affine.high(B[k, j]))) * u_max[j]
+            reach, sizes = reach - most, sizes + most
+        if not reach >= affine.ROUNDING * sizes:
             binding[count] = k
             count += 1
 
@@ -213,7 +214,7 @@ def _decide(
             cuts = phi[only] if alone or k == rows else phi[k]
             value, factor = least(forms, cuts, True, alone, epsilon)
             if not value >= 0.0:
-                _add_cost(forms, cuts, factor, half, 1.0 / scale[c], cost)
+                _add_cost(forms, cuts, factor, epsilon, half, 1.0 / scale[c], cost)
             spread = at[c, 0] + at[c, 1] * u[0] + at[c, 2] * u[1] - value
             weight[c] = max(spread, 1e-9 * scale[c])
             worst = min(worst, value)
@@ -235,11 +236,13 @@ def _decide(
             for j in range(nv):  # |L_g phi| is at least its part along its direction at the centre
                 n = B[k, j, 0] / length * (1.0 - 1e-14)
                 forms[: planes - 1] += n * B[k, j, : planes - 1]
-                forms[planes - 1] += abs(n) * B[k, j, planes - 1] + affine.ROUNDING * affine.radius(B[k, j])
+                forms[planes - 1] += (
+                    abs(n) * B[k, j, planes - 1] + affine.ROUNDING * (abs(B[k, j, 0]) + affine.radius(B[k, j]))
+                ) * affine.UP
             value, factor = least(forms, phi[only] if alone else phi[k], True, alone, epsilon)
             if not value >= LEAST_SHARE * length:
                 cost[:] = 0.0
-                _add_cost(forms, phi[only] if alone else phi[k], factor, half, 1.0, cost)
+                _add_cost(forms, phi[only] if alone else phi[k], factor, epsilon, half, 1.0, cost)
                 cut[b] = np.argmax(cost)
                 return
             lowest = min(lowest, value)
@@ -266,11 +269,17 @@ def _under(A: Any, B: Any, u: Any, out: Any) -> None:
 
 
 @exact_kernel
-def _add_cost(f: Any, phi: Any, multiplier: float, half: Any, factor: float, cost: Any) -> None:
-    """What each coordinate takes from a bound: what is linear in it, and its share of the remainders."""
-    n, total = len(half), 0.0
+def _add_cost(f: Any, phi: Any, multiplier: float, epsilon: float, half: Any, factor: float, cost: Any) -> None:
+    """What each coordinate takes from a bound: what is linear in it, and its shares of phi's range and the remainders.
+
+    What phi explains of a form ranges over the band's width all the same, unless the box is smaller.
+    """
+    n, squares, reach = len(half), 0.0, affine.TINY
     for i in range(n):
-        total += half[i] * half[i]
+        squares += half[i] * half[i]
+        reach += abs(phi[1 + i])
     rest = f[n + 1] + abs(multiplier) * phi[n + 1]
+    across = abs(multiplier) * min(0.5 * epsilon, reach) / reach
     for i in range(n):
-        cost[i] += factor * (abs(f[1 + i] - multiplier * phi[1 + i]) + rest * half[i] * half[i] / total)
+        linear = abs(f[1 + i] - multiplier * phi[1 + i]) + across * abs(phi[1 + i])
+        cost[i] += factor * (linear + rest * half[i] * half[i] / squares)
