@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import betaincinv
 
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.errors import InputError
+from ppcbf_robots.errors import CheckFailed
 from ppcbf_robots.evidence import POWER_TOLERANCE, least_phi
 from ppcbf_robots.filters import FilterConfig, Status, is_slow
 from ppcbf_robots.problem import Problem
@@ -59,7 +59,7 @@ def independent_band(
     :func:`ppcbf_robots.evidence.uniform_band` several states may share a position.)
 
     Raises:
-        InputError: if X seems to hold no state of the band.
+        CheckFailed: if X seems to hold no state of the band.
     """
     model, domain, epsilon = problem.model, problem.robot.domain, barrier.spec.epsilon
     kept_q: list[Array] = []
@@ -78,7 +78,7 @@ def independent_band(
             kept_v.append(v[on])
             found += len(on)
         if not found and tried >= MAX_TRIED:
-            raise InputError(f"none of {tried:,} uniform states of X lies on the band; is the safe set empty?")
+            raise CheckFailed(f"none of {tried:,} uniform states of X lies on the band: the safe set has collapsed")
     return np.concatenate(kept_q)[:count], np.concatenate(kept_v)[:count], tried
 
 

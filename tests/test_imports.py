@@ -16,6 +16,7 @@ import pytest
 
 LAYERS = [
     ["errors"],
+    ["certificate"],
     ["results_file"],
     ["sweep"],
     ["specs", "resources", "kernels"],
@@ -29,8 +30,9 @@ LAYERS = [
     ["filters"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],
-    ["benchmark", "viability", "safe_sets", "nmpc"],
+    ["benchmark", "viability", "safe_sets", "nmpc", "band_statistics", "proof"],
     ["learning"],
+    ["band_tasks"],
     ["export", "export_c", "plots", "plots_study", "viewer", "viewer_page", "viewer_shapes"],
     ["studies"],
     ["cli"],
@@ -39,7 +41,7 @@ LAYERS = [
 
 OWNERS = {
     "numba": ["kernels"],
-    "scipy": ["shapes", "body_fit", "ending", "viable_set"],
+    "scipy": ["shapes", "body_fit", "ending", "viable_set", "band_statistics"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
@@ -48,16 +50,16 @@ OWNERS = {
     "mujoco": ["engine_mujoco"],
     "hj_reachability": ["viability"],
     "jax": ["viability"],
-    "casadi": ["symbolic", "nmpc"],
+    "casadi": ["symbolic", "nmpc", "proof"],
     "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
-    "torch": ["learning", "export", "studies", "cli"],
+    "torch": ["learning", "export", "studies", "cli", "band_tasks"],
     "joblib": ["sweep", "cli"],
     "distributed": ["sweep"],
 }
 LAZY = {
-    "torch": ["export", "studies", "cli"],
+    "torch": ["export", "studies", "cli", "band_tasks"],
     "distributed": ["sweep"],
     "joblib": ["sweep", "cli"],
 }  # there only inside functions
@@ -68,6 +70,7 @@ SOURCES = {
     **{p.stem: p for p in (ROOT / PACKAGE).glob("*.py")},
     **{f"learning.{p.stem}": p for p in (ROOT / PACKAGE / "learning").glob("*.py")},
     **{f"world_files.{p.stem}": p for p in (ROOT / PACKAGE / "world_files").glob("*.py")},
+    **{f"proof.{p.stem}": p for p in (ROOT / PACKAGE / "proof").glob("*.py")},
     **{f"studies.{p.stem}": p for p in (ROOT / PACKAGE / "studies").glob("*.py")},
     **{f"cli.{p.stem}": p for p in (ROOT / "cli").glob("*.py")},
 }

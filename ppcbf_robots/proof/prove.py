@@ -15,7 +15,7 @@ import numpy as np
 from ppcbf_robots.artefact import StoredBarrier
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.certificate import Condition, Verdict
-from ppcbf_robots.errors import InputError
+from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.problem import Problem
@@ -88,11 +88,14 @@ def prove(
 
     Raises:
         InputError: for obstacles that have no symbolic form.
+        CheckFailed: if the band seems to be empty.
     """
     problem = problem.with_barrier_spec(stored.spec)
     barrier, config, passive = stored.barrier(problem), stored.filter_config(), stored.kind == "pp-ncbf"
     judge = BoxJudge(problem, stored.network, config, power)
     q, v, tried = uniform_band(problem, barrier, MARKERS, np.random.default_rng(0))
+    if not len(q):
+        raise CheckFailed(f"none of {tried:,} uniform states of X lies on the band: the safe set has collapsed")
     path, identity = folder / STATE, _identity(problem, stored, config, power)
     search = load_search(path, identity)
     if search is None:
@@ -102,7 +105,7 @@ def prove(
     run(search, judge, confirm, threads, seconds, on_round, lambda s: save_search(s, identity, path))
     if search.done:
         path.unlink(missing_ok=True)
-    band = len(q) / tried if tried else 0.0
+    band = len(q) / tried
     return Proof(search, _conditions(problem, stored, search, power, band), search.done, band)
 
 
@@ -150,7 +153,7 @@ def _conditions(
     on_band = f"on the whole band {{0 <= min_k phi_k <= {epsilon:g}, h >= 0}} in X"
     failed = len(search.infeasible)
     verdict = _verdict(failed, search.done and search.undecided_volume == 0.0)
-    share = search.undecided_volume / band if band else 1.0
+    share = search.undecided_volume / band
     conditions = {
         "feasibility": Condition(
             verdict,
@@ -162,7 +165,7 @@ def _conditions(
     if stored.kind == "pp-ncbf":
         failed = len(search.impassive)
         complete = search.done and search.impassive_volume == search.undecided_volume == 0.0
-        share = (search.impassive_volume + search.undecided_volume) / band if band else 1.0
+        share = (search.impassive_volume + search.undecided_volume) / band
         beyond = f" + {power:g} W" if power else ""
         conditions["passivity"] = Condition(
             _verdict(failed, complete),
