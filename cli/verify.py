@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ppcbf_robots.artefact import StoredBarrier, load_barrier
 from ppcbf_robots.band_tasks import BandJob, attack_tasks, conditions, sample_tasks
-from ppcbf_robots.certificate import Certificate, overall, save_certificate, subject
+from ppcbf_robots.certificate import Certificate, Condition, overall, save_certificate, subject
 from ppcbf_robots.cli.extras import needs
 from ppcbf_robots.cli.output import JsonOption, emit_json, err, out, table
 from ppcbf_robots.errors import CheckFailed, InputError
@@ -162,9 +162,13 @@ def _bar(what: str) -> Iterator[Callable[[float, str], None]]:
     """A bar on stderr that is told a share and some words."""
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.percentage:>5.1f} %"),
                TextColumn("{task.fields[words]}"), TimeElapsedColumn())  # fmt: skip
-    with Progress(*columns, console=err) as progress:
-        task = progress.add_task(what, total=1.0, words="")
-        yield lambda share, words: progress.update(task, completed=share, words=words)
+    try:
+        with Progress(*columns, console=err) as progress:
+            task = progress.add_task(what, total=1.0, words="")
+            yield lambda share, words: progress.update(task, completed=share, words=words)
+    except KeyboardInterrupt:
+        err.print("what is done so far is kept; the same command goes on from there")
+        raise
 
 
 def _save_states(problem: Problem, folder: Path, states: list[tuple[str, list[list[float]]]]) -> list[str]:
@@ -183,10 +187,26 @@ def _save_states(problem: Problem, folder: Path, states: list[tuple[str, list[li
 
 
 def _print(certificate: Certificate, files: list[str]) -> None:
-    rows = []
+    rows = [[name, c.verdict, _bound(name, c), "-" if c.violations is None else str(c.violations)]
+            for name, c in certificate.conditions.items()]  # fmt: skip
+    title = f"{certificate.verdict} by {certificate.method} in {certificate.seconds:.0f} s"
+    table(title, ["condition", "verdict", "bound", "states that break it"], rows)
     for name, c in certificate.conditions.items():
-        bound = "-" if c.bound is None else f"{c.bound:.3g}"
-        rows.append([name, c.verdict, bound, "-" if c.violations is None else str(c.violations), c.statement])
-    table(f"{certificate.verdict} by {certificate.method}", ["condition", "verdict", "bound", "found", "says"], rows)
+        out.print(f"{name}: {c.statement}")
+    passivity, excess = certificate.conditions.get("passivity"), certificate.details.get("largest_excess_power", 0.0)
+    if passivity is not None and passivity.verdict == "refuted" and excess > 0.0:
+        separate = certificate.details["separating"]
+        out.print(
+            f"passivity lacks up to {excess:.3g} W in the states found, in {separate:.0%} of which the nearest row "
+            f"separates; --power {2.0 * excess:.1g} would ask for a proof with such an allowance"
+        )
     out.print("not covered: " + "; ".join(certificate.not_covered))
     out.print("wrote " + ", ".join(files))
+
+
+def _bound(name: str, c: Condition) -> str:
+    if c.bound is None or name == "boundary_passivity":
+        return "-"
+    if c.confidence is not None:
+        return f"fails on {c.bound:.2g} of the band at most, {100 * c.confidence:g} % confidence"
+    return f"at least {c.bound:.3g}" if name == "Lg_phi" else f"fails on {c.bound:.2g} of the band at most"

@@ -39,6 +39,8 @@ class Proof:
     conditions: dict[str, Condition]
     complete: bool
     band: float  # volume of the band relative to X, from samples
+    separating: float  # share of the states that lack passivity, in which the row of least phi has ḣ > 0
+    rows: list[str]  # names of the rows that the proof is about
 
     @property
     def details(self) -> dict[str, Any]:
@@ -52,6 +54,8 @@ class Proof:
             "volume_undecided": s.undecided_volume,
             "band_volume": self.band,
             "largest_excess_power": s.excess,
+            "separating": self.separating,
+            "rows": self.rows,
         }
 
 
@@ -106,7 +110,17 @@ def prove(
     if search.done:
         path.unlink(missing_ok=True)
     band = len(q) / tried
-    return Proof(search, _conditions(problem, stored, search, power, band), search.done, band)
+    separating = float(np.mean([_separates(problem, barrier, x) for x in search.impassive] or [0.0]))
+    rows = problem.safety.names[: problem.safety.rows]
+    return Proof(search, _conditions(problem, stored, search, power, band), search.done, band, separating, rows)
+
+
+def _separates(problem: Problem, barrier: Barrier, x: Array) -> bool:
+    """Whether the row of least phi has ``ḣ > 0`` at a state."""
+    nv = problem.model.nv
+    dyn = problem.model.evaluate(problem.model.from_angles(x[:nv]), x[nv:])
+    safety = problem.safety.evaluate(dyn)
+    return bool(safety.hdot(dyn.v)[barrier.rows(dyn, safety).phi.argmin()] > 0.0)
 
 
 def _identity(problem: Problem, stored: StoredBarrier, config: FilterConfig, power: float) -> str:
