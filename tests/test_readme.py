@@ -47,7 +47,19 @@ def name_of(arguments: list[str]) -> str:
 
 
 def test_the_readme_names_every_command() -> None:
-    one = {"info", "train", "simulate", "view", "export", "compare", "convert", "bench", "bench train", "sweep", "verify"}
+    one = {
+        "info",
+        "train",
+        "simulate",
+        "view",
+        "export",
+        "compare",
+        "convert",
+        "bench",
+        "bench train",
+        "sweep",
+        "verify",
+    }
     studies = {f"study {name}" for name in ("convergence", "variability", "safe-set", "nmpc")}
     assert {name_of(c) for c in commands()} == one | studies
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.proof.boxes import OPEN, PROVED, BoxJudge, Verdicts
+from ppcbf_robots.proof.boxes import OFF_BAND, OPEN, PROVED, BoxJudge, Verdicts
 from ppcbf_robots.specs import Array
 
 BATCH = 8192  # boxes per thread and round
@@ -137,6 +137,7 @@ def _round(search: Search, judge: BoxJudge, confirm: Confirm, threads: int, pool
     position = np.empty(len(boxes), np.int64)
     position[order] = np.arange(len(boxes))
     old = position[search.home[here] - first]
+    assert not np.any(verdict.status[old] == OFF_BAND), "a state of the band lies in a box that was judged to be off it"
     search.impassive_markers[here] |= demoted[old]
     home = target[old]
     split = np.flatnonzero(np.isin(old, cut))
