@@ -55,7 +55,9 @@ class Certificate:
 
     def line(self) -> str:
         """One line for people."""
-        parts = ", ".join(f"{name} {c.verdict}" for name, c in self.conditions.items())
+        power = self.details.get("power", 0.0)
+        allowance = {"passivity": f" with {power:g} W beyond d_p"} if power else {}
+        parts = ", ".join(f"{name} {c.verdict}{allowance.get(name, '')}" for name, c in self.conditions.items())
         return f"{self.verdict} ({parts})"
 
     def gap(self, goal: Sequence[float], filter_kind: str, metric: str, alpha: float) -> str:

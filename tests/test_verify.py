@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import shutil
@@ -20,6 +21,7 @@ from ppcbf_robots.cli.main import main
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.falsifier import no_network
+from ppcbf_robots.learning.margin_descent import MarginDescent
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.specs import BarrierSpec
 
@@ -152,6 +154,12 @@ def test_a_verdict_that_its_conditions_do_not_bear_out_is_refused(folder, tmp_pa
     assert load_barrier(path).certificate is None
 
 
+def test_the_line_names_an_allowance(folder):
+    certificate = load_barrier(folder).certificate
+    allowed = dataclasses.replace(certificate, details={"power": 0.3})
+    assert "0.3 W beyond d_p" in allowed.line() and "W" not in certificate.line()
+
+
 def test_simulate_shows_the_certificate_and_what_it_is_not_about(folder, tmp_path):
     run = ("simulate", "two_link", "circle", "--barrier", folder, "--duration", "0.01", "--out", tmp_path / "t.npz")
     said = load_barrier(folder).certificate.line()
@@ -171,7 +179,9 @@ def test_a_proof_stops_in_time_and_says_what_is_open(folder, tmp_path):
     assert (path / "verify.npz").is_file()
 
 
-def test_learning_takes_counterexamples_and_refuses_what_is_none(folder, tmp_path):
+def test_learning_takes_counterexamples_and_refuses_what_is_none(tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr(MarginDescent, "add_counterexamples", lambda self, q, v: taken.append((q, v)))
     q, v, _ = uniform_band(p := load_problem("two_link", "circle"), p.barrier("lb-cbf"), 5, np.random.default_rng(0))
     np.savez(tmp_path / "good.npz", q=q, v=v)
     np.savez(tmp_path / "bad.npz", q=q, v=v[:, :1])
@@ -182,7 +192,10 @@ def test_learning_takes_counterexamples_and_refuses_what_is_none(folder, tmp_pat
     for name, words in (("bad", "this robot needs"), ("nan", "not finite"), ("text", "arrays q and v"), ("no", "npz")):
         done = run_cli(*train, tmp_path / f"{name}.npz")
         assert done.code == 2 and words in " ".join(done.stderr.split()), done.stderr
+    assert not taken
     assert run_cli(*train, tmp_path / "good.npz").code in (0, 3)
+    np.testing.assert_array_equal(taken[0][0], q)
+    np.testing.assert_array_equal(taken[0][1], v)
 
 
 @pytest.mark.parametrize(

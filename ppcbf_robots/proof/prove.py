@@ -110,7 +110,8 @@ def prove(
     if search.done:
         path.unlink(missing_ok=True)
     band = len(q) / tried
-    separating = float(np.mean([_separates(problem, barrier, x) for x in search.impassive] or [0.0]))
+    leaving = sum(_separates(problem, barrier, x) for x in search.impassive)
+    separating = leaving / max(1, len(search.impassive))
     rows = problem.safety.names[: problem.safety.rows]
     return Proof(search, _conditions(problem, stored, search, power, band), search.done, band, separating, rows)
 
