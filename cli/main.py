@@ -22,6 +22,7 @@ from ppcbf_robots.cli.simulate import simulate
 from ppcbf_robots.cli.study import study
 from ppcbf_robots.cli.sweep import sweep
 from ppcbf_robots.cli.train import train
+from ppcbf_robots.cli.verify import verify
 from ppcbf_robots.cli.view import view
 from ppcbf_robots.errors import PPCBFError
 
@@ -33,7 +34,7 @@ app = typer.Typer(
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
     "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed, 130 stopped by Ctrl-C.",
 )
-for command in (info, train, simulate, campaign, compare, view, export, convert, sweep, report, faults):
+for command in (info, train, simulate, campaign, compare, view, export, convert, sweep, verify, report, faults):
     app.command()(command)
 app.add_typer(bench, name="bench")
 app.add_typer(study, name="study")

@@ -75,6 +75,8 @@ def simulate(
     trajectory = run(problem, chosen, config, q, v, duration, {"barrier": barrier}, engine)
     trajectory.save(out_file)
     facts = trajectory.summary(model) | {"outside_domain": outside_domain(problem, trajectory), "out": str(out_file)}
+    said = certificate_line(problem, barrier, config)
+    facts |= {"certificate": said}
     emit_json(facts) if json else _print(facts, trajectory, problem)
     if chosen is not None and facts["outside_domain"] > 0.0:
         err.print(
@@ -99,6 +101,18 @@ def outside_domain(problem: Problem, trajectory: Trajectory) -> float:
     out_q = (q < domain.q[:, 0] - 1e-9) | (q > domain.q[:, 1] + 1e-9)
     out_v = (trajectory.v < domain.v[:, 0] - 1e-9) | (trajectory.v > domain.v[:, 1] + 1e-9)
     return float(np.mean((out_q | out_v).any(axis=1)))
+
+
+def certificate_line(problem: Problem, name: str, config: FilterConfig) -> str | None:
+    """What the certificate of a barrier folder says, and about what else if not this; None for other barriers."""
+    if not Path(name).is_dir():
+        return None
+    certificate = load_barrier(Path(name)).certificate
+    if certificate is None:
+        return "none; ppcbf verify makes one"
+    goal = problem.model.to_angles(problem.robot.goal)
+    gap = certificate.gap(goal, config.kind, config.metric, config.alpha)
+    return certificate.line() + (f"; {gap}, not for this run" if gap else "")
 
 
 def choose_barrier(
@@ -195,6 +209,8 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
         out.print(f"end                {end.text()}")
     if meta["contacts"] is not None:
         _print_contacts(meta["contacts"], len(trajectory.t))
+    if facts["certificate"] is not None:
+        out.print(f"certificate        {facts['certificate']}")
     out.print("filter             " + ", ".join(f"{k} {n}" for k, n in facts["filter_counts"].items()))
     out.print(f"wrote {facts['out']}; look at it with: ppcbf view {facts['out']}")
 

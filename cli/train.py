@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -16,6 +18,8 @@ from ppcbf_robots.artefact import save_barrier
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.robot import RobotModel
+from ppcbf_robots.specs import Array
 
 if TYPE_CHECKING:
     from ppcbf_robots.learning.train import Monitor, Result
@@ -37,6 +41,9 @@ def train(
     iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
     time_limit: Annotated[float, typer.Option(min=1.0, help="Stop training after so many seconds.")] = 3600.0,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in DIR.")] = False,
+    counterexamples: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="States (q, v) to learn from, as `ppcbf verify` writes them.")
+    ] = None,
     tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
     json: JsonOption = False,
 ) -> None:
@@ -53,13 +60,35 @@ def train(
         problem = problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": gamma}))
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
-    report = train_barrier(problem, barrier, preset, seed, out_dir, device, iterations, time_limit, resume, tensorboard)
+    states = None if counterexamples is None else load_states(counterexamples, problem.model)
+    report = train_barrier(
+        problem, barrier, preset, seed, out_dir, device, iterations, time_limit, resume, tensorboard, states
+    )
     if json:
         emit_json(report)
     else:
         _print(report)
     if not report["converged"]:
         raise CheckFailed(f"not converged: {report['reason']}; the best barrier so far is in {out_dir}")
+
+
+def load_states(path: Path, model: RobotModel) -> tuple[Array, Array]:
+    """States q (n, nq), v (n, nv) of an npz file.
+
+    Raises:
+        InputError: if it cannot be read, or does not hold finite states of this robot.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            q, v = (np.asarray(file[name], dtype=float) for name in "qv")
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise InputError(f"--counterexamples: {path} is not an npz file with the arrays q and v") from None
+    if q.ndim != 2 or not len(q) or q.shape[1] != model.nq or v.shape != (len(q), model.nv):
+        expected = f"q (n, {model.nq}) and v (n, {model.nv})"
+        raise InputError(f"--counterexamples: {path} holds q {q.shape} and v {v.shape}, this robot needs {expected}")
+    if not (np.isfinite(q).all() and np.isfinite(v).all()):
+        raise InputError(f"--counterexamples: {path} holds numbers that are not finite")
+    return q, v
 
 
 def train_barrier(
@@ -73,6 +102,7 @@ def train_barrier(
     time_limit: float = float("inf"),
     resume: bool = False,
     tensorboard: Path | None = None,
+    counterexamples: tuple[Array, Array] | None = None,
 ) -> dict[str, Any]:
     """Train with a progress bar, save the barrier, and return the keys of ``ppcbf train --json``."""
     import torch  # takes seconds: only where it is needed
@@ -94,6 +124,8 @@ def train_barrier(
     trainer = Trainer(problem, kind, chosen, seed, where)
     if resume:
         load_checkpoint(trainer, folder)
+    if counterexamples is not None:
+        trainer.descent.add_counterexamples(*counterexamples)
     with _progress(kind, chosen.iterations) as show, _tensorboard(tensorboard) as record:
 
         def on_check(monitor: Monitor) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -15,11 +16,14 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from ppcbf_robots.barriers import Barrier, BarrierKind
+from ppcbf_robots.certificate import Certificate, load_certificate
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.network import NetworkKind, NumpyNetwork, Params
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import BarrierSpec, Positive, Spec, validate
+
+log = logging.getLogger(__name__)
 
 FORMAT = 3
 KEYS = {"kind": str, "network": str, "formula": dict, "filter": dict, "fingerprint": dict, "weights_sha256": str,
@@ -44,6 +48,7 @@ class StoredBarrier:
     network: NumpyNetwork
     filter: dict[str, Any]  # kind, metric and alpha of the filter it was trained for
     data: dict[str, Any]  # barrier.json
+    certificate: Certificate | None = None  # what `ppcbf verify` found out; None if it was not asked, or of another
 
     def filter_config(self, **changes: Any) -> FilterConfig:
         """Settings of the filter the barrier was trained for, with changes such as ``dt`` or ``solver``."""
@@ -157,7 +162,13 @@ def load_barrier(folder: Path) -> StoredBarrier:
         raise InputError(f"{path}: the weights' shapes do not fit {joints} joints; the files do not belong together")
     trained = validate(data["filter"], TrainedFilter, f"{path}: filter")
     spec = validate(data["formula"], BarrierSpec, f"{path}: formula")
-    return StoredBarrier(data["kind"], spec, NumpyNetwork(data["network"], params), trained.model_dump(), data)
+    try:
+        certificate = load_certificate(folder, data)
+    except InputError as error:
+        log.warning("the certificate is ignored: %s", error)
+        certificate = None
+    network = NumpyNetwork(data["network"], params)
+    return StoredBarrier(data["kind"], spec, network, trained.model_dump(), data, certificate)
 
 
 def _shapes_fit(kind: NetworkKind, params: Params, nv: int) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,6 +12,7 @@ from ppcbf_robots.errors import InputError
 
 NAME = "certificate.json"
 FORMAT = 1
+GOAL_TOLERANCE = 1e-9  # [rad | m]
 CERTIFIED = ("proved", "bounded")
 
 Verdict = Literal["proved", "bounded", "refuted", "undecided"]
@@ -54,8 +55,19 @@ class Certificate:
 
     def line(self) -> str:
         """One line for people."""
-        parts = ", ".join(f"{name} {c.verdict}" for name, c in self.conditions.items())
+        power = self.details.get("power", 0.0)
+        allowance = {"passivity": f" with {power:g} W beyond d_p"} if power else {}
+        parts = ", ".join(f"{name} {c.verdict}{allowance.get(name, '')}" for name, c in self.conditions.items())
         return f"{self.verdict} ({parts})"
+
+    def gap(self, goal: Sequence[float], filter_kind: str, metric: str, alpha: float) -> str:
+        """Why it does not speak about a filter and a goal (one number per joint), as a clause; "" if it does."""
+        known = self.subject["filter"]
+        if (filter_kind, metric, alpha) != (known["kind"], known["metric"], known["alpha"]):
+            return f"for the {known['kind']} filter in the {known['metric']} metric with alpha = {known['alpha']:g}"
+        if any(abs(a - b) > GOAL_TOLERANCE for a, b in zip(goal, self.subject["goal"], strict=True)):
+            return "passivity for another goal"
+        return ""
 
     def report(self) -> dict[str, Any]:
         """As JSON."""

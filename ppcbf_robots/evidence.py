@@ -58,7 +58,7 @@ def uniform_band(
         if not free.size:
             continue
         v = domain.sample_v(rng, len(free) * VELOCITIES).reshape(len(free), VELOCITIES, model.nv)
-        phi = _least_phi(problem, barrier, q[free], safety.h[free], safety.grad[free], v)
+        phi = least_phi(problem, barrier, q[free], safety.h[free], safety.grad[free], v)
         i, j = np.nonzero((phi >= 0.0) & (phi <= eps))
         found_q.append(q[free][i])
         found_v.append(v[i, j])
@@ -70,7 +70,7 @@ def uniform_band(
     return q, v, tried
 
 
-def _least_phi(problem: Problem, barrier: Barrier, q: Array, h: Array, grad: Array, v: Array) -> Array:
+def least_phi(problem: Problem, barrier: Barrier, q: Array, h: Array, grad: Array, v: Array) -> Array:
     """min_k phi_k at velocities v (B, V, nv) of configurations q (B, nq); needs no dynamics for rho barriers.
 
     Where rho < 0, rho itself may be returned: K >= 0 only takes away from it, and the network is what takes time.

@@ -35,6 +35,11 @@ def kernel(function: F) -> F:
     return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=FAST_MATH)(function))
 
 
+def exact_kernel(function: F) -> F:
+    """The same with IEEE arithmetic as written, for bounds that count rounding errors; runs beside other threads."""
+    return cast(F, numba.njit(cache=True, error_model="numpy", nogil=True)(function))
+
+
 @kernel
 def _ramp(x: float, rho: float) -> tuple[float, float, float]:
     """Smoothed ``max(x, 0)`` and its first two derivatives."""

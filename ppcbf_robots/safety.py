@@ -103,21 +103,37 @@ class SafetyFunction:
 
     def evaluate(self, dyn: Dynamics, obstacles: Packed | None = None) -> SafetyRows:
         """h and its terms of every row; leading batch axes follow ``dyn``. ``obstacles``: where they are now."""
-        o, points = obstacles or self.packed, self.points
         lead, nv = dyn.v.shape[:-1], self.robot.nv
         count = int(np.prod(lead, dtype=int))
-        h, drift, curvature = (np.empty((count, self.rows)) for _ in range(3))
-        grad = np.empty((count, self.rows, nv))
-        rows_at(
+        h, grad, drift, curvature = self._fill(
             dyn.placements.reshape(count, -1, 4, 4), dyn.J.reshape(count, 6, nv), dyn.dJ.reshape(count, 6, nv),
-            dyn.v.reshape(count, nv), self.robot.to_angles(dyn.q).reshape(count, nv),
+            dyn.v.reshape(count, nv), self.robot.to_angles(dyn.q).reshape(count, nv), obstacles or self.packed,
+        )  # fmt: skip
+        shape = (*lead, self.rows)
+        return SafetyRows(h.reshape(shape), grad.reshape(*shape, nv), drift.reshape(shape), curvature.reshape(shape))
+
+    def first_order(self, q: Array) -> tuple[Array, Array]:
+        """h (B, rows) and its gradient (B, rows, nv) at configurations q (B, nq), without the dynamics."""
+        placements, J = self.robot.kinematics(q)
+        rest = np.zeros((len(q), self.robot.nv))
+        h, grad, _, _ = self._fill(placements, J, np.zeros_like(J), rest, self.robot.to_angles(q), self.packed)
+        return h, grad
+
+    def _fill(
+        self, placements: Array, J: Array, dJ: Array, v: Array, angles: Array, o: Packed
+    ) -> tuple[Array, Array, Array, Array]:
+        """h, gradient, drift and curvature of a batch."""
+        count, points = len(v), self.points
+        h, drift, curvature = (np.empty((count, self.rows)) for _ in range(3))
+        grad = np.empty((count, self.rows, self.robot.nv))
+        rows_at(
+            placements, J, dJ, v, angles,
             points.joints, points.offsets, points.mask, self._radii,
             o.kinds, o.sizes, o.margins, o.planes, o.plane_start, o.frames, o.motions,
             self._self_pairs, self._limit_joint, self._limit_sign, self._limit_bound,
             h, grad, drift, curvature,
         )  # fmt: skip
-        shape = (*lead, self.rows)
-        return SafetyRows(h.reshape(shape), grad.reshape(*shape, nv), drift.reshape(shape), curvature.reshape(shape))
+        return h, grad, drift, curvature
 
     def least(self, q: Array) -> tuple[float, str]:
         """Smallest h at rest in q and the name of its row."""

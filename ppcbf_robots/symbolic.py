@@ -104,10 +104,7 @@ def safety_rows(safety: SafetyFunction) -> ca.Function:
     if safety.pairs > len(safety.body) * len(safety.obstacles):
         raise InputError("the predictive controller knows no self-collision: leave it out of the robot spec")
     angles = ca.SX.sym("q", robot.nv)
-    frames: list[tuple[Any, Any]] = [(ca.SX.eye(3), ca.SX.zeros(3))]
-    for i, joint in enumerate(_joints(robot)):
-        (R, p), (R_joint, p_joint) = frames[joint.parent], joint.placement(angles[i])
-        frames.append((R @ R_joint, p + R @ p_joint))
+    frames = _frames(robot, angles)
     h = []
     for body, at, offset in zip(safety.body, safety.points.joints, safety.points.offsets, strict=True):
         R, p = frames[at]
@@ -115,6 +112,26 @@ def safety_rows(safety: SafetyFunction) -> ca.Function:
         h += [_distance(o, point) - body.radius - o.margin for o in safety.obstacles]
     h += [sign * (angles[i] - bound) for i, sign, bound in safety.limits]
     return ca.Function("h", [angles], [ca.vertcat(*h)])
+
+
+def potential_energy(robot: RobotModel) -> ca.Function:
+    """``P = f(angles)`` [J], as :meth:`RobotModel.potential_energy`."""
+    angles = ca.SX.sym("q", robot.nv)
+    frames, gravity = _frames(robot, angles), robot.model.gravity.linear
+    total = ca.SX(0.0)
+    for i in range(1, robot.model.njoints):
+        (R, p), link = frames[i], robot.model.inertias[i]
+        total -= link.mass * ca.dot(ca.DM(gravity), p + R @ link.lever)
+    return ca.Function("P", [angles], [total])
+
+
+def _frames(robot: RobotModel, angles: Any) -> list[tuple[Any, Any]]:
+    """Rotation (3, 3) and origin (3,) of every joint's frame in the base frame, the universe's first."""
+    frames: list[tuple[Any, Any]] = [(ca.SX.eye(3), ca.SX.zeros(3))]
+    for i, joint in enumerate(_joints(robot)):
+        (R, p), (R_joint, p_joint) = frames[joint.parent], joint.placement(angles[i])
+        frames.append((R @ R_joint, p + R @ p_joint))
+    return frames
 
 
 def _distance(obstacle: Obstacle, point: Any) -> Any:

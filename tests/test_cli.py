@@ -255,7 +255,7 @@ def test_simulate_reports_what_the_trajectory_holds(tmp_path, two_link):
     assert set(found) == {"min_h", "clearance", "max_torque_ratio", "max_rate_ratio", "rate_violations", "energy_rise",
                           "injected", "reached_goal", "goal_error", "cleared_at", "rests_on", "end", "contacts",
                           "hull_contacts", "contact_with",
-                          "filter_counts", "outside_domain", "out"}  # fmt: skip
+                          "filter_counts", "outside_domain", "certificate", "out"}  # fmt: skip
     with np.load(path) as file:
         assert len(file["t"]) == sum(found["filter_counts"].values()) == 21
         assert found["min_h"] == file["h"].min()

@@ -31,9 +31,10 @@ LAYERS = [
     ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],
     ["lockstep"],
     ["campaign"],
-    ["benchmark", "viability", "safe_sets", "nmpc", "faults"],
+    ["benchmark", "viability", "safe_sets", "nmpc", "faults", "band_statistics", "proof"],
     ["fault_cases", "artefact_faults"],
     ["learning"],
+    ["band_tasks"],
     ["export", "export_c", "plots", "plots_study", "viewer", "viewer_page", "viewer_shapes"],
     ["studies"],
     ["report", "report_page", "report_parts"],
@@ -43,7 +44,7 @@ LAYERS = [
 
 OWNERS = {
     "numba": ["kernels"],
-    "scipy": ["shapes", "body_fit", "ending", "viable_set"],
+    "scipy": ["shapes", "body_fit", "ending", "viable_set", "band_statistics"],
     "proxsuite": ["qp"],
     "daqp": ["qp"],
     "qpsolvers": ["qp", "cli"],
@@ -53,16 +54,16 @@ OWNERS = {
     "mujoco": ["engine_mujoco"],
     "hj_reachability": ["viability"],
     "jax": ["viability"],
-    "casadi": ["symbolic", "nmpc"],
+    "casadi": ["symbolic", "nmpc", "proof"],
     "pydantic": ["specs", "world"],
     "yaml": ["specs"],
     "typer": ["cli"],
-    "torch": ["learning", "export", "studies", "cli"],
+    "torch": ["learning", "export", "studies", "cli", "band_tasks"],
     "joblib": ["sweep", "cli"],
     "distributed": ["sweep"],
 }
 LAZY = {
-    "torch": ["export", "studies", "cli"],
+    "torch": ["export", "studies", "cli", "band_tasks"],
     "distributed": ["sweep"],
     "joblib": ["sweep", "cli"],
 }  # there only inside functions
@@ -73,6 +74,7 @@ SOURCES = {
     **{p.stem: p for p in (ROOT / PACKAGE).glob("*.py")},
     **{f"learning.{p.stem}": p for p in (ROOT / PACKAGE / "learning").glob("*.py")},
     **{f"world_files.{p.stem}": p for p in (ROOT / PACKAGE / "world_files").glob("*.py")},
+    **{f"proof.{p.stem}": p for p in (ROOT / PACKAGE / "proof").glob("*.py")},
     **{f"studies.{p.stem}": p for p in (ROOT / PACKAGE / "studies").glob("*.py")},
     **{f"cli.{p.stem}": p for p in (ROOT / "cli").glob("*.py")},
 }
