@@ -264,7 +264,7 @@ class QPFilter:
         self.solver: QPSolver = make_solver(config.solver)
 
     def _class_k(self, limited: bool) -> tuple[float, float, float, float]:
-        """Class-K gains [1/s]: of the barrier's rows, added where pairs separate, of the velocity domain; the margin."""
+        """Class-K gains [1/s]: of the barrier's rows, added where pairs separate, of the velocity domain; margin."""
         fastest, fast = self.fastest if limited else np.inf, self.config.fast_alpha
         if self.barrier.kind == "pp-cbf":
             return min(self.barrier.spec.gamma_K, fastest), 0.0, min(fast, fastest), 0.0

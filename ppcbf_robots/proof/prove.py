@@ -207,8 +207,8 @@ def _verdict(counterexamples: int, complete: bool) -> Verdict:
 def _boundary_passivity(problem: Problem, stored: StoredBarrier) -> Condition:
     """Passivity of the correction on phi = 0, which the form of K_theta gives.
 
-    ``v·w_k = ḣ_k - v·∂K/∂v = phi_k - gamma h_k - (v·∂K/∂v - K)``, and the bracket is never negative: K is a cone and a bowl
-    of the velocity, convex and zero with zero slope at rest, and a sum of Bregman divergences of softplus in
+    ``v·w_k = ḣ_k - v·∂K/∂v = phi_k - gamma h_k - (v·∂K/∂v - K)``, and the bracket is never negative: K is a cone
+    and a bowl of the velocity, convex and zero with zero slope at rest, and a sum of Bregman divergences of softplus in
     ``z_j = b_j(q)·v``, convex in z_j and zero with zero slope at z_j = 0, each times a softplus, which is positive.
     That holds for any finite weights, and loading a barrier refuses others. Random
     states tell whether the code computes that form.
