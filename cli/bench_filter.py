@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ import typer
 from rich.progress import track
 
 from ppcbf_robots.benchmark import STAGES, Case, crowd, default_barrier, measure
-from ppcbf_robots.cli.output import JsonOption, emit_json, err, out, table
+from ppcbf_robots.cli.output import JsonOption, alarms_expected, emit_json, err, out, table
 from ppcbf_robots.cli.simulate import choose_barrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig
@@ -38,8 +37,8 @@ def bench(
 
     Example: ppcbf bench panda --steps 2000
     """
-    logging.disable(logging.WARNING)  # random weights make some states infeasible, which is not what is looked at
-    cases = _world(robot, obstacles, barrier, steps) if obstacles else _crowds(robot, pairs or list(PAIRS), steps)
+    with alarms_expected():  # random weights make some states infeasible, which is not what is looked at
+        cases = _world(robot, obstacles, barrier, steps) if obstacles else _crowds(robot, pairs or list(PAIRS), steps)
     if figure is not None:
         from ppcbf_robots import plots  # matplotlib only where it is needed
 

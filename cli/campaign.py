@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import hashlib
 import json as json_module
-import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import typer
 
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.campaign import Drawing, draw, outcome, run_cases, total
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, alarms_expected, emit_json, out, table
 from ppcbf_robots.cli.simulate import choose_barrier, described, mujoco_engine
 from ppcbf_robots.cli.tasks import DaskOption, run_tasks
 from ppcbf_robots.engines import EngineName
@@ -63,9 +62,9 @@ class Chunk:
             run.meta["pushes"] = [{**dataclasses.asdict(p), "torque": p.torque.tolist()} for p in case.pushes]
             yield case, run
 
+    @alarms_expected()
     def run(self) -> dict[str, Any]:
         """Figures of every run, as JSON."""
-        logging.getLogger("ppcbf_robots").setLevel(logging.ERROR)  # alarms of the filter are counted, not printed
         began = time.process_time()
         problem, _, _ = self.load()
         outcomes = [outcome(problem, case, run) for case, run in self.trajectories()]
@@ -179,9 +178,9 @@ def _facts(whole: Chunk, records: Sequence[Record]) -> dict[str, Any]:
     return {**made, **dataclasses.asdict(whole.drawing), **total(outcomes), "seconds": seconds}
 
 
+@alarms_expected()
 def _write(folder: Path, facts: dict[str, Any], worst: Chunk) -> None:
     """The figures, by an atomic rename, and the worst run."""
-    logging.getLogger("ppcbf_robots").setLevel(logging.ERROR)
     [(_, run)] = worst.trajectories()
     run.save(folder / WORST)
     temporary = folder / f".{SUMMARY}.tmp"

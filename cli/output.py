@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
@@ -26,6 +29,18 @@ WorldArgument = Annotated[
     typer.Argument(metavar="OBSTACLES", help="Bundled world name, or path: YAML (ours, cuRobo, MoveIt), .scene, URDF."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout instead of text.")]
+
+
+@contextmanager
+def alarms_expected() -> Iterator[None]:
+    """The filter's alarms are not logged, where they are counted or shown in another way."""
+    logger = logging.getLogger("ppcbf_robots")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def emit_json(data: dict[str, Any]) -> None:

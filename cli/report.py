@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.certificate import load_certificate
-from ppcbf_robots.cli.output import JsonOption, emit_json, err, out
+from ppcbf_robots.cli.output import JsonOption, alarms_expected, emit_json, err, out
 from ppcbf_robots.cli.simulate import run
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import load_problem
@@ -44,16 +43,16 @@ def report(
     figures = None if campaign is None else page.read_campaign(campaign, problem)
     if out_file.is_dir():
         raise InputError(f"--out: {out_file} is a folder; give a file such as {out_file}/report.html")
-    logging.getLogger("ppcbf_robots").setLevel(logging.ERROR)  # the run's alarms are in the report
-    start = problem.robot.start, problem.robot.start_velocity
-    problem.check_start(start[0])
-    trajectory = run(problem, barrier, stored.filter_config(), *start, duration, {"barrier": str(folder)})
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True) as progress:
-        bar = progress.add_task("timing the filter", total=2 + len(page.PARTS))
-        case = page.time_filter(problem, barrier, stored, steps)
-        material = page.Material(folder, problem, stored, barrier, trajectory, case, certificate, figures)
-        page.write_report(material, out_file, lambda what: progress.update(bar, advance=1, description=what))
+    with alarms_expected():  # the run's are in the report
+        start = problem.robot.start, problem.robot.start_velocity
+        problem.check_start(start[0])
+        trajectory = run(problem, barrier, stored.filter_config(), *start, duration, {"barrier": str(folder)})
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
+        with Progress(*columns, console=err, transient=True) as progress:
+            bar = progress.add_task("timing the filter", total=2 + len(page.PARTS))
+            case = page.time_filter(problem, barrier, stored, steps)
+            material = page.Material(folder, problem, stored, barrier, trajectory, case, certificate, figures)
+            page.write_report(material, out_file, lambda what: progress.update(bar, advance=1, description=what))
     facts = trajectory.summary(problem.model)
     if json:
         verdict = None if certificate is None else certificate.verdict
