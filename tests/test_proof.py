@@ -215,7 +215,8 @@ def feasible(problem, barrier, x, config, passive=True):
     dyn = problem.model.evaluate(problem.model.from_angles(x[:nv]), x[nv:])
     rows = barrier.rows(dyn, problem.safety.evaluate(dyn))
     nominal = problem.robot.controller.evaluate(dyn)
-    A, b = -rows.Lg_phi, rows.Lf_phi + config.alpha * (rows.phi - config.margin)
+    separating = config.fast_alpha * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+    A, b = -rows.Lg_phi, rows.Lf_phi + config.alpha * (rows.phi - config.margin) + separating
     if passive:
         A, b = np.vstack([A, dyn.v]), np.append(b, dyn.v @ nominal.u + nominal.d_p + free_power(problem.model))
     return linprog(np.zeros(nv), A, b + 1e-9, bounds=[(-u, u) for u in problem.model.u_max]).status == 0

@@ -58,7 +58,7 @@ class BoxJudge:
         u_max = np.ones(JOINTS)
         u_max[: model.nv] = model.u_max
         self._settings = (problem.safety.rows, spec.gamma, config.alpha, config.margin, spec.epsilon, u_max,
-                          free_power(model) + power, 1.0 / (self.high - self.low))  # fmt: skip
+                          free_power(model) + power, 1.0 / (self.high - self.low), config.fast_alpha)  # fmt: skip
 
     def __call__(self, boxes: Array, passive: NDArray[np.bool_]) -> Verdicts:
         """Verdicts on boxes (B, 2, 2 nv) of lower and upper corners (angles, velocities).
@@ -107,9 +107,10 @@ def judge(
 def _rows(model: Any, state: Any, head: Any, net: Any, settings: Any, phi: Any, A: Any, B: Any) -> None:
     """Forms of phi_k, and of A and B such that every constraint on the torque reads ``A_k + B_k u >= 0``.
 
-    Row k is ``psi_k(u) + alpha (phi_k - margin)``, the one after the last row ``power + v · (u_rest - u)``.
+    Row k is ``psi_k(u) + alpha (phi_k - margin) + fast_alpha max(0, min(ḣ_k, phi_k))``, the last term from below
+    and with phi_k >= 0, as it is on the band; the one after the last row ``power + v · (u_rest - u)``.
     """
-    rows, gamma, alpha, margin = settings[0], settings[1], settings[2], settings[3]
+    rows, gamma, alpha, margin, fast_alpha = settings[0], settings[1], settings[2], settings[3], settings[8]
     nv, planes = len(state) // 2, state.shape[1]
     K, K_q_rate, K_v = np.empty(planes), np.empty(planes), np.empty((nv, planes))
     v = state[nv:]
@@ -131,6 +132,15 @@ def _rows(model: Any, state: Any, head: Any, net: Any, settings: Any, phi: Any, 
         affine.scaled(form, alpha, form)
         affine.add(model[at + 2], learned, -1.0, A[k])
         affine.add(A[k], form, 1.0, A[k])
+        least_hdot, least_phi = affine.low(model[at + 1]), max(0.0, affine.low(phi[k]))
+        if least_hdot > 0.0 and affine.high(model[at + 1]) <= least_phi:
+            affine.scaled(model[at + 1], fast_alpha, form)
+            affine.add(A[k], form, 1.0, A[k])
+        elif least_hdot > 0.0 and affine.high(phi[k]) <= least_hdot and least_phi > 0.0:
+            affine.scaled(phi[k], fast_alpha, form)
+            affine.add(A[k], form, 1.0, A[k])
+        else:
+            affine.shifted(A[k], fast_alpha * max(0.0, min(least_hdot, least_phi)) * (1.0 - 1e-14), A[k])
         for j in range(nv):
             affine.add(model[at + 3 + j], pushed[j], -1.0, B[k, j])
     affine.shifted(model[power], settings[6], A[rows])

@@ -172,8 +172,8 @@ def _conditions(
     conditions = {
         "feasibility": Condition(
             verdict,
-            f"a torque within the limits satisfies psi_k(u) >= -alpha (phi_k - margin) for all {rows} rows {on_band}; "
-            "where a pair separates the filter asks for less",
+            f"a torque within the limits satisfies psi_k(u) >= -alpha (phi_k - margin) - fast_alpha max(0, min(hdot_k, "
+            f"phi_k)) for all {rows} rows {on_band}",
             bound=min(1.0, share) if search.done else 1.0,
             violations=failed,
         )
