@@ -41,7 +41,10 @@ def verify(
     method: Annotated[
         Method, typer.Option(help="auto: a proof where there can be one (two joints), else samples.")
     ] = "auto",
-    power: Annotated[float, typer.Option(min=0.0, help="Allowed beyond d_p in the passivity row [W]; proof.")] = 0.0,
+    power: Annotated[
+        float,
+        typer.Option(min=0.0, help="Allowed in the passivity row beyond what the filter allows itself [W]; proof."),
+    ] = 0.0,
     samples: Annotated[int, typer.Option(min=1, help="Independent states of the band.")] = 69_075,
     confidence: Annotated[float, typer.Option(help="Of the bound of the violation measure.")] = 0.999,
     seconds: Annotated[float, typer.Option(min=0.0, help="Of the gradient attack.")] = 60.0,
@@ -198,7 +201,7 @@ def _print(certificate: Certificate, files: list[str]) -> None:
         separate = certificate.details["separating"]
         out.print(
             f"passivity lacks up to {excess:.3g} W in the states found, in {separate:.0%} of which the nearest row "
-            f"separates; --power {2.0 * excess:.1g} would ask for a proof with such an allowance"
+            f"separates; --power {2.0 * excess:.1g} would ask for a proof with so much more"
         )
     out.print("not covered: " + "; ".join(certificate.not_covered))
     out.print("wrote " + ", ".join(files))

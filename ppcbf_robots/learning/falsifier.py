@@ -74,7 +74,7 @@ class Falsifier:
         if len(index):
             rays = Rays(**to_tensors([{k: x[index] for k, x in arrays.items()}], device, dtype))
             level = torch.as_tensor(points[index, -1] * self.band.epsilon, device=device, dtype=dtype)
-            s, crosses = self.band.field.on_band(params, rays, level)
+            s, crosses = self.band.field.on_band(params, rays, level, rising=True)
             on = crosses.nonzero()[:, 0]
             index, chosen = index[on.cpu().numpy()], rays.select(on)
             margin[index] = self.band.margin(params, chosen, s[on]).detach().cpu().numpy()

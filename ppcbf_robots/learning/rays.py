@@ -104,8 +104,14 @@ class Field:
         return (starts >= level) & (ends < level)
 
     @torch.no_grad()
-    def on_band(self, params: Params, rays: Rays, level: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """s with ``min_k phi_k(s) = level`` by bisection, and which rays cross that level at all."""
+    def on_band(
+        self, params: Params, rays: Rays, level: torch.Tensor, rising: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """s with ``min_k phi_k(s) = level`` by bisection, and which rays cross that level at all.
+
+        They fall through it on the way out; with ``rising`` also those count that are below it at rest, closer than
+        ``level / gamma``, and end above it, as where an arm leaves an obstacle.
+        """
         hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
         K = value_along(torch, self.kind, params, rays.q, rays.d)
 
@@ -117,9 +123,14 @@ class Field:
         low, high = torch.zeros_like(level), torch.ones_like(level)
         at_low, at_high = excess(low), excess(high)
         crosses = (at_low >= 0.0) & (at_high < 0.0)
+        sign = torch.ones_like(level)
+        if rising:
+            rises = (at_low < 0.0) & (at_high >= 0.0)
+            crosses, sign = crosses | rises, torch.where(rises, -1.0, 1.0)
+        at_low, at_high = sign * at_low, sign * at_high
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            value = excess(middle)
+            value = sign * excess(middle)
             ok = value >= 0.0
             low, at_low = torch.where(ok, middle, low), torch.where(ok, value, at_low)
             high, at_high = torch.where(ok, high, middle), torch.where(ok, at_high, value)
