@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
 import json
 import shutil
@@ -20,6 +21,7 @@ from hypothesis import settings
 from PIL import Image
 
 from ppcbf_robots.barriers import Barrier, BarrierKind
+from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.network import NetworkKind, NumpyNetwork
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -69,6 +71,21 @@ def two_link(problems: dict[str, Problem]) -> Problem:
 @pytest.fixture
 def panda(problems: dict[str, Problem]) -> Problem:
     return problems["panda"]
+
+
+@pytest.fixture(scope="session")
+def brisk_panda(cache_folder: Path) -> Problem:
+    """The Panda among five spheres with springs that leave hardly any torque beside gravity."""
+    problem = load_problem("panda", "five_spheres")
+    gains = Gains(
+        "bounded_spring",
+        np.array([120.0, 90.0, 110.0, 110.0, 18.0, 18.0, 8.0]),
+        np.array([14.0, 11.0, 12.0, 11.0, 1.6, 1.6, 0.8]),
+        np.array([60.0, 30.0, 50.0, 50.0, 8.0, 8.0, 8.0]),
+    )
+    controller = NominalController(problem.model, gains, problem.robot.goal)
+    problem = dataclasses.replace(problem, robot=dataclasses.replace(problem.robot, controller=controller))
+    return problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": 20.0}))
 
 
 @pytest.fixture

@@ -65,13 +65,13 @@ def test_batch_motion_is_the_engines(problem, states):
 def test_runs_together_are_the_runs_alone(problem, make_barrier, barrier_name, kind):
     """With pushes and another plant, for every barrier: every recorded value, the status of every step, the ending.
 
-    Not longer than 0.1 s: with random weights a filter may part runs tenfold every 5 ms.
+    Not longer than 0.06 s: with random weights a filter may part runs tenfold every 5 ms.
     """
     barrier, config = make_barrier(problem, barrier_name), FilterConfig(kind=kind)
-    drawing = Drawing(seed=1, duration=0.1, pushes=True, mass_error=0.2)
+    drawing = Drawing(seed=1, duration=0.06, pushes=True, mass_error=0.2)
     cases = [draw(problem, problem.barrier("lb-cbf"), drawing, i) for i in range(3)]
-    for case, run in zip(cases, run_cases(problem, barrier, config, cases, 0.1), strict=True):
-        other = alone(problem, barrier, config, case, 0.1)
+    for case, run in zip(cases, run_cases(problem, barrier, config, cases, 0.06), strict=True):
+        other = alone(problem, barrier, config, case, 0.06)
         usual = int(np.cumprod(other.status < Status.INVALID).sum())  # until no real arm would move so fast
         assert usual == len(other.t) or (kind == "closed-form" and usual > 20)
         for name in FIELDS:

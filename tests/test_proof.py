@@ -26,7 +26,7 @@ from ppcbf_robots.proof.prove import STATE, prove
 from ppcbf_robots.proof.witness import best_torque, least
 
 S = 3  # symbols of the random forms
-number = st.floats(-3.0, 3.0)
+number = st.floats(-3.0, 3.0).filter(lambda x: x == 0.0 or abs(x) > 1e-90)  # cubes of others underflow
 small = st.one_of(st.just(0.0), st.floats(-0.7, 0.7))
 form = st.tuples(number, small, small, small, st.floats(0.0, 0.3)).map(lambda x: np.array(x))
 L = np.longdouble

@@ -18,7 +18,6 @@ from ppcbf_robots.cli.main import app
 from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, QPFilter, Status, free_power
-from ppcbf_robots.problem import load_problem
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -166,7 +165,7 @@ def test_the_answer_is_the_least_correction_within_the_rate(panda, states):
         assert whole == z.found
         if z.found:
             np.testing.assert_allclose(answer.u, nominal.u + z.x * model.u_max, atol=1e-5 * model.u_max.max())
-    assert seen[Status.CORRECTING] > 30 and seen[Status.INFEASIBLE] > 10 and seen[Status.PASSIVITY_DROPPED] > 0
+    assert seen[Status.CORRECTING] > 20 and seen[Status.INFEASIBLE] > 10 and seen[Status.PASSIVITY_DROPPED] > 0
 
 
 def test_out_of_reach_the_worst_row_is_as_good_as_the_rate_allows(cartpole, states):
@@ -225,9 +224,9 @@ def test_the_closed_form_is_clipped_and_says_so(cartpole):
 
 
 @pytest.fixture(scope="module")
-def fast_panda(cache_folder):
-    """The Panda with a spring four times as stiff and up to 60 % of its torque, through five spheres at full speed."""
-    problem = load_problem("panda", "five_spheres")
+def fast_panda(brisk_panda):
+    """The Panda with a spring four times as stiff again and up to 60 % of its torque, at full speed."""
+    problem = brisk_panda
     model, g = problem.model, problem.robot.controller.gains
     gains = Gains("bounded_spring", 4.0 * g.kp, g.kd, np.minimum(2.0 * g.max_spring, 0.6 * model.u_max))
     controller = NominalController(model, gains, problem.robot.goal)
