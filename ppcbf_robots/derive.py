@@ -12,6 +12,7 @@ from ppcbf_robots.specs import Array, ControllerSpec, DomainSpec, per_joint
 SAMPLES = 1000  # configurations over which gravity and inertia are bounded; with 200 rare light postures are missed
 SAMPLE_SEED = 0
 DAMPING_SHARE = 0.5  # of the torque left beside gravity, taken by damping at the fastest velocity of X
+SPRING_SHARE = 0.3  # of what then is left, taken by the spring; with all of it hardly a torque is passive that brakes
 SPRING_RATE = 4.0  # [1/s], K_p / K_d: the rate at which a heavily damped joint closes its error
 DT = 1e-3  # [s], control period the derived damping must suit
 DAMPING_LIMIT = 0.7  # of λ_max(M⁻¹ K_d) dt; 1 would overshoot within one period
@@ -52,7 +53,8 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
 
     Damping at the fastest velocity of X takes half of the torque beside gravity, less where ``λ_max(M⁻¹ K_d) dt``
     would exceed 0.7 over sampled configurations; the spring is as stiff as a damping ratio of 0.5 on the mean joint
-    inertia allows, and its bound leaves room for gravity and damping.
+    inertia allows, and its bound leaves room for gravity, damping and the filter: where gravity, spring and a barrier
+    each want nearly all of a joint, no barrier is passive.
     """
     spec = spec or ControllerSpec()
     rng = np.random.default_rng(SAMPLE_SEED)
@@ -74,7 +76,7 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
     names = robot.joint_names
     kp = kp if spec.kp is None else per_joint(spec.kp, names, "controller.kp", kp)
     kd = kd if spec.kd is None else per_joint(spec.kd, names, "controller.kd", kd)
-    f_max = np.maximum(robot.u_max - g_max - kd * fastest, 0.05 * robot.u_max)
+    f_max = SPRING_SHARE * np.maximum(robot.u_max - g_max - kd * fastest, 0.05 * robot.u_max)
     f_max = f_max if spec.max_spring is None else per_joint(spec.max_spring, names, "controller.max_spring", f_max)
     for what, values, least in (("kp", kp, 0.0), ("kd", kd, 0.0), ("max_spring", f_max, 1e-9)):
         if np.any(values < least):

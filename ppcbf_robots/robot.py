@@ -20,6 +20,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.joints import check_inertias, force_limits, lock, locked_joints, position_limits, rate_limits
 from ppcbf_robots.kernels import mirror, points_at
 from ppcbf_robots.meshes import Meshes
+from ppcbf_robots.rigid_tree import RigidTree, bodies_of
 from ppcbf_robots.specs import Array, PayloadSpec, PerJoint, vector
 from ppcbf_robots.urdf import check_urdf
 
@@ -82,8 +83,8 @@ class BodyPoints:
         count, points = int(np.prod(lead, dtype=int)), len(self)
         p, Jdot_v, J = np.empty((count, points, 3)), np.empty((count, points, 3)), np.empty((count, points, 3, nv))
         points_at(
-            dyn.placements.reshape(count, -1, 4, 4), dyn.J.reshape(count, 6, nv), dyn.dJ.reshape(count, 6, nv),
-            dyn.v.reshape(count, nv), self.joints, self.offsets, self.mask, p, J, Jdot_v,
+            dyn.placements.reshape(count, *dyn.placements.shape[-3:]), dyn.J.reshape(count, 6, nv),
+            dyn.dJ.reshape(count, 6, nv), dyn.v.reshape(count, nv), self.joints, self.offsets, self.mask, p, J, Jdot_v,
         )  # fmt: skip
         shape = (*lead, points, 3)
         return PointKinematics(p.reshape(shape), J.reshape(*shape, nv), Jdot_v.reshape(shape))
@@ -142,6 +143,7 @@ class RobotModel:
         self.friction = np.zeros(self.nv)  # Coulomb [N m | N], of a plant alone: `evaluate` and the filter know none
         self._oMi = _strided(self.data.oMi)
         self._index_joints()
+        self.tree = RigidTree(self.model)
         names = self.joint_names
         self.u_max, self.v_max = force_limits(self.urdf, names, facts.joints, effort, velocity)
         self.u_rate = rate_limits(self.urdf, names, effort_rate)
@@ -244,9 +246,9 @@ class RobotModel:
         return out
 
     def evaluate_batch(self, q: Array, v: Array) -> Dynamics:
-        """The same for a batch: q (B, nq), v (B, nv); every array gains a leading axis B."""
-        rows = [vars(self.evaluate(qi, vi)) for qi, vi in zip(q, v, strict=True)]
-        return Dynamics(**{k: np.stack([r[k] for r in rows]) for k in rows[0]})
+        """The same for a batch, compiled: q (B, nq), v (B, nv); every array gains a leading axis B."""
+        bodies = np.repeat(bodies_of(self.model)[None], len(v), axis=0)
+        return Dynamics(**self.tree.terms(q, v, bodies))
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
         """Forward dynamics by the articulated-body algorithm, (nv,)."""

@@ -106,8 +106,9 @@ class SafetyFunction:
         lead, nv = dyn.v.shape[:-1], self.robot.nv
         count = int(np.prod(lead, dtype=int))
         h, grad, drift, curvature = self._fill(
-            dyn.placements.reshape(count, -1, 4, 4), dyn.J.reshape(count, 6, nv), dyn.dJ.reshape(count, 6, nv),
-            dyn.v.reshape(count, nv), self.robot.to_angles(dyn.q).reshape(count, nv), obstacles or self.packed,
+            dyn.placements.reshape(count, *dyn.placements.shape[-3:]), dyn.J.reshape(count, 6, nv),
+            dyn.dJ.reshape(count, 6, nv), dyn.v.reshape(count, nv), self.robot.to_angles(dyn.q).reshape(count, nv),
+            obstacles or self.packed,
         )  # fmt: skip
         shape = (*lead, self.rows)
         return SafetyRows(h.reshape(shape), grad.reshape(*shape, nv), drift.reshape(shape), curvature.reshape(shape))

@@ -74,18 +74,28 @@ def panda(problems: dict[str, Problem]) -> Problem:
 
 
 @pytest.fixture(scope="session")
-def brisk_panda(cache_folder: Path) -> Problem:
-    """The Panda among five spheres with springs that leave hardly any torque beside gravity."""
-    problem = load_problem("panda", "five_spheres")
-    gains = Gains(
-        "bounded_spring",
-        np.array([120.0, 90.0, 110.0, 110.0, 18.0, 18.0, 8.0]),
-        np.array([14.0, 11.0, 12.0, 11.0, 1.6, 1.6, 0.8]),
-        np.array([60.0, 30.0, 50.0, 50.0, 8.0, 8.0, 8.0]),
-    )
-    controller = NominalController(problem.model, gains, problem.robot.goal)
-    problem = dataclasses.replace(problem, robot=dataclasses.replace(problem.robot, controller=controller))
-    return problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": 20.0}))
+def make_brisk_panda(cache_folder: Path) -> Callable[[str], Problem]:
+    """The Panda in a world, with springs that leave hardly any torque beside gravity."""
+
+    def make(world: str) -> Problem:
+        problem = load_problem("panda", world)
+        gains = Gains(
+            "bounded_spring",
+            np.array([120.0, 90.0, 110.0, 110.0, 18.0, 18.0, 8.0]),
+            np.array([14.0, 11.0, 12.0, 11.0, 1.6, 1.6, 0.8]),
+            np.array([60.0, 30.0, 50.0, 50.0, 8.0, 8.0, 8.0]),
+        )
+        controller = NominalController(problem.model, gains, problem.robot.goal)
+        problem = dataclasses.replace(problem, robot=dataclasses.replace(problem.robot, controller=controller))
+        return problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": 20.0}))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def brisk_panda(make_brisk_panda: Callable[[str], Problem]) -> Problem:
+    """That among five spheres."""
+    return make_brisk_panda("five_spheres")
 
 
 @pytest.fixture

@@ -240,7 +240,7 @@ def _two_link():
 def test_campaign_ends_with_3_where_the_unfiltered_arm_runs_into_things(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert (
-        run("panda", "table_boxes", "--rollouts", 4, "--barrier", "none", "--duration", 1, monkeypatch=monkeypatch) == 3
+        run("panda", "table_boxes", "--rollouts", 4, "--barrier", "none", "--duration", 3, monkeypatch=monkeypatch) == 3
     )
     shown = capsys.readouterr()
     facts = json.loads((tmp_path / "campaign" / "campaign.json").read_text())

@@ -196,7 +196,7 @@ def test_train(training, barrier):
     assert {p.name for p in barrier.iterdir()} == {"barrier.json", "weights.safetensors", "checkpoint.safetensors"}
     stored = json.loads((barrier / "barrier.json").read_text())["training"]
     assert {k: stored[k] for k in training if k != "out"} == {k: x for k, x in training.items() if k != "out"}
-    assert [m["iteration"] for m in stored["history"]] == [25, 50]
+    assert [m["iteration"] for m in stored["history"]] == [40, 50]
 
 
 def test_train_resumes_and_says_so_in_words(barrier, tmp_path):

@@ -177,12 +177,13 @@ def test_between_the_steps_the_slip_leaves_more_of_the_margin(cartpole, dt):
     assert without < kept - 5e-5
 
 
-def test_a_payload_the_filter_does_not_know_of_does_no_harm(panda):
+def test_a_payload_the_filter_does_not_know_of_does_no_harm(make_brisk_panda):
+    panda = make_brisk_panda("sphere")
     plant = perturbed(panda.model, payload=PayloadSpec(frame="panda_hand", mass=2.0))
     phi, h, rise = least_phi(panda, plant, DT)
     blind = least_phi(panda, plant, DT, slip_time=np.inf)
     assert h > 0.0 and phi > -5e-3
-    assert blind[0] < -0.02  # 20 times the margin
+    assert blind[0] < -0.05  # 50 times the margin
     assert rise <= blind[2] + 1e-3
 
 

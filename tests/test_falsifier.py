@@ -14,7 +14,7 @@ import torch
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning import falsifier as module
 from ppcbf_robots.learning.band import Band
-from ppcbf_robots.learning.falsifier import STARTS, Attack, Falsifier
+from ppcbf_robots.learning.falsifier import CULLED, CULLING, FIRST_STEP, LAST_STEP, STARTS, Attack, Falsifier
 from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
 from ppcbf_robots.network import NumpyNetwork, random_convex
 from ppcbf_robots.problem import Problem, load_problem
@@ -93,7 +93,7 @@ def test_a_planted_violation_is_found_and_is_one_for_the_runtime_filter(weak, pa
 
 def test_it_also_finds_what_few_states_of_the_band_violate(brisk_panda):
     """The LB barrier drops passivity somewhere."""
-    found = attack(brisk_panda, rounds=3)
+    found = attack(brisk_panda, rounds=30)
     assert found.worst < 0.0
     clear = margins(brisk_panda, found.q, found.v) < -1e-6
     assert clear.mean() > 0.9
@@ -141,20 +141,51 @@ def test_it_ends_in_time(weak):
     assert attack(weak, seconds=0.0, rounds=1000).evaluated == attack(weak, rounds=0).evaluated
 
 
-def test_it_starts_where_it_is_told_to(weak):
-    """At points in collision or that never reach the band there is nothing to descend on."""
+def test_a_search_goes_on_where_it_was(weak):
+    """Starts are judged anew, never move to a larger margin, and are replaced where their step is used up."""
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(weak).items()}
+    falsifier = make(weak)
+    starts = falsifier.start()
+    falsifier.search(params, rounds=3, starts=starts)
+    assert starts.points.shape == (STARTS, 5) and (starts.age <= 3).all() and (starts.step >= LAST_STEP).all()
+    before, value = starts.points.copy(), starts.value.copy()
+    np.testing.assert_allclose(falsifier.margins(params, before)[0], value)
+    starts.value[:] = 7.0
+    found = falsifier.search(params, rounds=0, starts=starts)
+    assert found.evaluated == STARTS and found.worst == value.min()
+    np.testing.assert_array_equal(starts.value, value)
+    starts.step[:10] = 0.5 * LAST_STEP
+    falsifier.search(params, rounds=1, starts=starts)
+    assert (starts.value[10:] <= value[10:]).all()
+    assert (starts.age[:10] == 0).all() and (starts.step[:10] == FIRST_STEP).all()
+
+
+def test_those_behind_give_way(two_link):
+    """After CULLING rounds a third of the starts is new."""
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(two_link).items()}
+    falsifier = make(two_link)
+    starts = falsifier.start()
+    falsifier.search(params, rounds=CULLING - 1, starts=starts)
+    old = (starts.age == CULLING - 1).sum()
+    assert old > 0.8 * STARTS
+    starts = falsifier.start()
+    falsifier.search(params, rounds=CULLING, starts=starts)
+    assert (starts.age == 0).sum() >= int(CULLED * STARTS)
+    assert (starts.age == CULLING).sum() > 0.4 * STARTS
+
+
+def test_it_ends_when_it_has_enough(weak):
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(weak).items()}
+    few, many = (make(weak).search(params, rounds=5, enough=n) for n in (100, np.inf))
+    assert 100 <= len(few.q) < len(many.q)
+    assert few.evaluated < many.evaluated
+
+
+def test_off_the_band_there_is_nothing(weak):
+    """Points in collision or that never reach the band have no margin."""
     params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(weak).items()}
     falsifier, domain = make(weak), weak.robot.domain
-    bad = attack(weak, rounds=0)
-    phi = weak.barrier("lb-cbf").rows(*evaluated(weak, bad.q, bad.v)).phi.min(-1)
-    level = np.clip(phi / weak.robot.spec.barrier.epsilon, 0.0, 1.0)
-    starts = np.hstack([weak.model.to_angles(bad.q), bad.v, level[:, None]])[:10]
-    given = starts.copy()
-    found = falsifier.search(params, rounds=0, starts=starts)
-    assert (found.evaluated, len(found.q)) == (10, 10)
-    np.testing.assert_array_equal(starts, given)
     away = np.hstack([domain.q[:, :1].T, np.array([[-4.0, 0.0, 0.5]])])
     least, _, v = falsifier.margins(params, away)
     assert np.isinf(least[0]) and not v.any()
-    nothing = falsifier.search(params, rounds=3, starts=np.zeros((0, 5)))
-    assert (nothing.worst, len(nothing.q), nothing.evaluated) == (np.inf, 0, 0)
+    assert falsifier.margins(params, np.zeros((0, 5)))[0].shape == (0,)

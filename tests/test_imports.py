@@ -21,7 +21,7 @@ LAYERS = [
     ["specs", "resources", "kernels"],
     ["network_kernel", "dynamics_kernel"],
     ["urdf", "urdf_parts", "world", "body", "body_geometry", "body_fit", "body_cache"],
-    ["shapes", "world_shapes", "joints", "meshes", "mesh_contact"],
+    ["shapes", "world_shapes", "joints", "meshes", "mesh_contact", "rigid_tree"],
     ["robot", "world_files"],
     ["safety", "controllers", "network", "engines", "plant", "pushes", "batch_dynamics"],
     ["condense", "ending"],

@@ -165,7 +165,7 @@ def test_the_answer_is_the_least_correction_within_the_rate(panda, states):
         assert whole == z.found
         if z.found:
             np.testing.assert_allclose(answer.u, nominal.u + z.x * model.u_max, atol=1e-5 * model.u_max.max())
-    assert seen[Status.CORRECTING] > 20 and seen[Status.INFEASIBLE] > 10 and seen[Status.PASSIVITY_DROPPED] > 0
+    assert seen[Status.CORRECTING] > 10 and seen[Status.INFEASIBLE] > 10 and seen[Status.PASSIVITY_DROPPED] > 0
 
 
 def test_out_of_reach_the_worst_row_is_as_good_as_the_rate_allows(cartpole, states):

@@ -119,7 +119,10 @@ def test_a_robot_of_one_joint_has_no_slices(tmp_path, monkeypatch, capsys, rando
       <joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
       <limit lower="-1.5" upper="1.5" effort="20" velocity="2"/></joint></robot>""")
     spec, world = tmp_path / "one.yaml", tmp_path / "w.yaml"
-    spec.write_text("urdf: one.urdf\nbody:\n  - {frame: arm, center: [1, 0, 0], radius: 0.05}\n")
+    spec.write_text(
+        "urdf: one.urdf\nbody:\n  - {frame: arm, center: [1, 0, 0], radius: 0.05}\n"
+        "controller: {type: bounded_spring, kp: 40, kd: 4, max_spring: 10}\n"
+    )
     world.write_text("obstacles:\n  - {name: <b>ball</b>, type: sphere, center: [0, 1.2, 0], radius: 0.1}\n")
     problem = load_problem(str(spec), str(world))
     network = random_network("convex", problem.model.nq, problem.model.nv)

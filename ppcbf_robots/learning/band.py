@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -12,7 +13,7 @@ from ppcbf_robots.learning.rays import Field, Rays
 from ppcbf_robots.network import NetworkKind, Params
 from ppcbf_robots.problem import Problem
 
-LEVELS = (0.0, 0.5, 1.0)  # of epsilon, at which a ray's least margin is sought
+LEVELS = (0.0, 0.5, 1.0)  # of the band's width, at which a ray's least margin is sought
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,11 @@ class Band:
         self.u_max = torch.as_tensor(model.u_max, device=device, dtype=dtype)
         self.kd = torch.as_tensor(problem.robot.controller.gains.kd, device=device, dtype=dtype)
         self.free_power = free_power(model)
+        self.floor = config.margin if config.kind == "qp" else 0.0  # its rows keep the state above that level
+
+    def level(self, share: Any) -> Any:
+        """The level of phi at a share of the band's width."""
+        return self.floor + share * (self.epsilon - self.floor)
 
     def nominal(self, rays: Rays, s: torch.Tensor) -> Nominal:
         """The nominal torque at v = s d and its dissipation."""
@@ -65,7 +71,7 @@ class Band:
         """Least margin over the band along every ray (B,), infinite where none crosses it, and its s (B,)."""
         least, at = torch.full_like(rays.d[:, 0], torch.inf), torch.zeros_like(rays.d[:, 0])
         for level in LEVELS:
-            s, crosses = self.field.on_band(params, rays, torch.full_like(least, level * self.epsilon))
+            s, crosses = self.field.on_band(params, rays, torch.full_like(least, self.level(level)))
             found = crosses.nonzero()[:, 0]
             if not len(found):
                 continue

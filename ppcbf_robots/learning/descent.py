@@ -120,7 +120,7 @@ class Descent(ABC):
         """
         index = torch.randint(len(self.rays) if pool is None else len(pool), (count,), generator=self.generator)
         index = index.to(self.device) if pool is None else pool[index.to(self.device)]
-        level = torch.rand(count, generator=self.generator).to(self.device, self.dtype) * self.epsilon
+        level = self.band.level(torch.rand(count, generator=self.generator).to(self.device, self.dtype))
         s, crosses = self.band.field.on_band(params or self.params, self.rays.select(index), level)
         return index[crosses], s[crosses], crosses
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
-from ppcbf_robots.learning.falsifier import STARTS, Attack, Falsifier
+from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
 from ppcbf_robots.learning.parameters import Tensors
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
@@ -24,7 +24,7 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 AVERAGING = 0.03  # of the parameters per iteration, in the average that checks and evidence look at
-NEAR = 4.0  # times the wanted margin: rays below it are drawn as often as all others together
+NEAR = 0.1  # above the wanted margin: rays below it are drawn as often as all others together
 FAR_AWAY = 1.0  # margin noted for rays that do not cross the band
 EXPLORED = 1_600  # new rays per check, around those of small margin
 SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
@@ -32,11 +32,11 @@ POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.2  # factor on the wanted margin per refinement
-MAX_MARGIN = 0.3
+STRICTER = 1.5  # factor on the wanted margin per refinement
+MIN_MARGIN, MAX_MARGIN = 0.01, 0.3
 SIMPLER = 1.5  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
-HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
+HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
 
 
 class MarginDescent(Descent):
@@ -45,24 +45,27 @@ class MarginDescent(Descent):
     def __init__(self, problem: Problem, kind: LearnedKind, preset: Preset, seed: int, device: str) -> None:
         super().__init__(problem, kind, preset, seed, device)
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
+        self._joints = problem.model.nv
+        self.margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
+        self._hunt = self.falsifier.start()  # goes on from check to check
         self._first_pool = len(self.rays)
-        self._max_weight, self._simplicity = preset.volume_weight, preset.simplicity
-        self._weight: torch.Tensor = torch.tensor(preset.volume_weight, device=self.device)
+        self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
+        self._weight: torch.Tensor = torch.tensor(self._max_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
         self.judged = {k: x.detach().clone() for k, x in self.params.items()}
         self._look()
 
     def iterate(self) -> None:
         """A batch of band states, half of them where margins are small; one step; the weight's update."""
-        p = self.preset
+        count = self.preset.samples
         self.set_rate()
         if not len(self._crossing):
             self.iteration += 1
             return  # the band is empty: the set has collapsed, and the checks will say so
-        index, s, _ = self.sample(p.samples, self._crossing)
+        index, s, _ = self.sample(count, self._crossing)
         drawn = len(index)
         if len(self._near):
-            near, s_near, _ = self.sample(p.samples, self._near)
+            near, s_near, _ = self.sample(count, self._near)
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
@@ -77,7 +80,7 @@ class MarginDescent(Descent):
         short = (margin < self.margin).nonzero()[:, 0]  # the others have no gradient
         if len(short):
             wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short]))
-            loss = loss + wanting.sum() / len(index) + p.worst_weight * wanting.mean()
+            loss = loss + wanting.sum() / len(index) + self.preset.worst_weight * wanting.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
@@ -105,10 +108,10 @@ class MarginDescent(Descent):
         """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
         found = self._explore()
         self._look()
-        attack = self.falsifier.search(self.judged, rounds=self.preset.search_rounds, starts=self._starts())
-        if len(attack.q):
-            self.add_counterexamples(attack.q, attack.v)
-            self._look()
+        attack = self.falsifier.search(self.judged, rounds=self.preset.search_rounds * self._joints, starts=self._hunt)
+        self.add_counterexamples(attack.q, attack.v)
+        self._join(self._hunted())
+        self._look()
         with torch.no_grad():
             index, s, crosses = self.sample(CHECK_STATES, params=self.judged)
             if not len(index):
@@ -128,15 +131,12 @@ class MarginDescent(Descent):
         new = (crossing & torch.isinf(self._noted)).nonzero()[:, 0]
         if len(new):
             self._noted[new] = self.band.least_margin(self.params, self.rays.select(new))[0].clamp(max=FAR_AWAY)
-        self._near = (crossing & (self._noted < NEAR * self.margin)).nonzero()[:, 0]
+        self._near = (crossing & (self._noted < NEAR + self.margin)).nonzero()[:, 0]
 
-    def _starts(self) -> Array:
-        """Points of some of the rays of least margin, for the falsifier."""
-        least = self._crossing[self._noted[self._crossing].argsort()[: 4 * STARTS]]
-        chosen = least[torch.randperm(len(least), generator=self.generator)[:STARTS].to(self.device)]
-        rays = self.rays.select(chosen)
-        angles = self.problem.model.to_angles(rays.q.cpu().double().numpy())
-        return np.concatenate([angles, rays.d.cpu().double().numpy(), self.rng.random((len(angles), 1))], 1)
+    def _hunted(self) -> Rays:
+        """Rays on which the falsifier now sees less than the margin wanted."""
+        points, nv = self._hunt.points[self._hunt.value < self.margin], self.problem.model.nv
+        return self.rays_through(self.problem.model.from_angles(points[:, :nv]), points[:, nv:-1])
 
     def _explore(self) -> float:
         """New rays about those of least margin; the share of them that violate."""
@@ -158,7 +158,7 @@ class MarginDescent(Descent):
         d = d + size * self.rng.normal(size=d.shape) * np.ptp(domain.v, axis=1)
         rays = self.rays_through(model.from_angles(np.clip(angles, domain.q[:, 0], domain.q[:, 1])), d)
         least = self.band.least_margin(self.judged, rays)[0]
-        small = (least < NEAR * self.margin).nonzero()[:, 0]
+        small = (least < NEAR + self.margin).nonzero()[:, 0]
         self._join(rays.select(small), least[small])
         return float((least < 0.0).float().mean())
 
@@ -175,9 +175,9 @@ class MarginDescent(Descent):
             self.rays, self._noted = self.rays.select(kept), self._noted[kept]
 
     def attack(self, params: dict[str, Array]) -> Attack:
-        """The falsifier's search against given parameters."""
+        """The falsifier's search against given parameters, until it has as many states as can join."""
         tensors = {k: self._tensor(x) for k, x in params.items()}
-        return self.falsifier.search(tensors, rounds=self.preset.attack_rounds)
+        return self.falsifier.search(tensors, rounds=self.preset.attack_rounds * self._joints, enough=TAKEN)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""
@@ -199,6 +199,7 @@ class MarginDescent(Descent):
         added = self.rays.select(slice(self._first_pool, None))
         tensors = {f"rays/{k}": x for k, x in vars(added).items()}
         tensors |= {f"judged/{k}": self.judged[k] for k in self.trained}
+        tensors |= {f"hunt/{k}": torch.as_tensor(x) for k, x in vars(self._hunt).items()}
         tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
         return tensors, {"margin": self.margin, "max_weight": self._max_weight, "simplicity": self._simplicity}
 
@@ -208,6 +209,9 @@ class MarginDescent(Descent):
             **{k.removeprefix("rays/"): x.to(self.device) for k, x in tensors.items() if k.startswith("rays/")}
         )
         self.rays = self.rays.select(slice(self._first_pool)).join(added)
+        self._hunt = Starts(
+            **{k.removeprefix("hunt/"): x.numpy().copy() for k, x in tensors.items() if k.startswith("hunt/")}
+        )
         self.judged |= {k: tensors[f"judged/{k}"].to(self.device) for k in self.trained}
         self._noted, self._weight, self._crossing, self._near = (
             tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")

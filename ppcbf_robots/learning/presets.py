@@ -28,13 +28,13 @@ class Preset:
     top: int = 100  # closed form: k of Top_k
     l2: float = 0.0  # closed form: weight of the L2 penalty (mean square of the weights)
     simplicity: float = 0.0  # QP: weight of the mean square of the rate of K along the motion
-    volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: the largest weight of the volume
+    volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: the volume's largest, over all joints
     worst_weight: float = 0.0  # QP: of the mean over violations, beside their sum over the batch
     critic_weight: float = 10.0  # closed form: initial λ of both constraints
     critic_growth: float = 1.01  # closed form: factor on λ after an iteration with violations
     critic_decay: float = 0.99  # closed form: factor on λ after one without
     critic_bounds: tuple[float, float] = (1.0, 1000.0)  # closed form
-    margin: float = 0.03  # dimensionless reserve the critics ask for in training
+    margin: float = 0.03  # dimensionless reserve the critics ask for in training; QP: for each joint but one
     random_goals: float = 0.0  # share of rays whose nominal torque aims at a random goal
     rays: int = 20_000
     rows_per_ray: int = 8
@@ -42,12 +42,12 @@ class Preset:
     check_every: int = 50  # iterations between checks on fresh states
     patience: int = 6  # clean checks in a row, without gain of volume, that end training early
     counterexample_copies: int = 15  # closed form: how often a counterexample's ray stands in the pool
-    search_rounds: int = 0  # QP: of the falsifier at every check
+    search_rounds: int = 0  # QP: of the falsifier at every check, per joint
     refinements: int = 4  # further rounds when the evidence finds violations
     refinement_share: float = 0.5  # of the planned iterations, added by each
     min_volume: float = 0.2  # of the LB set; less counts as collapsed
     test_samples: int = 5_000  # uniform band states of the evidence
-    attack_rounds: int = 0  # QP: of the falsifier in the evidence
+    attack_rounds: int = 0  # QP: of the falsifier in the evidence, per joint
     changes: tuple[str, ...] = field(default=())  # departures from the paper, shown to the user
 
 
@@ -79,19 +79,20 @@ DEFAULT = Preset(
     metric="kinetic",
     learning_rate=3e-3,
     gamma=15.0,
-    volume_weight=0.2,
+    volume_weight=0.6,
     worst_weight=0.5,
     simplicity=1.0,
     random_goals=0.5,
     rays=60_000,
     iterations=800,
-    check_every=25,
-    patience=12,
+    check_every=40,
+    margin=0.02,
+    patience=8,
     search_rounds=8,
     refinements=8,
     refinement_share=0.3,
     test_samples=10_000,
-    attack_rounds=150,
+    attack_rounds=200,
 )
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}

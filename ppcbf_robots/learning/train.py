@@ -23,6 +23,7 @@ from ppcbf_robots.specs import Array
 
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
 CANDIDATES = 3  # clean parameter sets tried by the evidence
+APART = 5e-3  # of the LB set's volume, by which they differ at least: what is wrong with one is so with its like
 DESCENTS: dict[str, type[Descent]] = {"closed-form": PaperDescent, "qp": MarginDescent}  # by the filter that will run
 
 
@@ -180,7 +181,11 @@ class Trainer:
         )  # fmt: skip
         self.history.append(monitor)
         if monitor.clean:
-            self.clean = sorted([*self.clean, (monitor.volume_kept, snapshot)], key=lambda c: -c[0])[:CANDIDATES]
+            kept: list[tuple[float, dict[str, Array]]] = []
+            for volume, params in sorted([*self.clean, (monitor.volume_kept, snapshot)], key=lambda c: -c[0]):
+                if not kept or volume <= kept[-1][0] - APART:
+                    kept.append((volume, params))
+            self.clean = kept[:CANDIDATES]
         return monitor
 
     def _start_inside(self, params: dict[str, Array]) -> bool:

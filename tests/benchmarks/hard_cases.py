@@ -71,7 +71,7 @@ def panda() -> Spec:
     factor = RATIO / (model.u_max / np.maximum(g, 1e-9)).min()
     limits = {n: float(factor * u) for n, u in zip(model.joint_names, model.u_max, strict=True)}
     spec = bundled("panda") | {"effort": limits}
-    del spec["controller"]
+    spec.pop("controller", None)
     return spec
 
 
