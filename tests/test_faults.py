@@ -17,6 +17,7 @@ from ppcbf_robots.cli.main import app, main
 from ppcbf_robots.fault_cases import CASES
 from ppcbf_robots.faults import Fault, Loop, inject, judge, onset
 from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.resources import find_robot
 from ppcbf_robots.safety_filter import SafetyFilter, StepResult
 
 WORST = {
@@ -26,13 +27,17 @@ WORST = {
     "u_des NaN": "FAULT", "d_p NaN": "FAULT", "payload": "CORRECTING", "all by chance": "CORRECTING",
     "obstacle touches": "INFEASIBLE", "obstacle NaN": "FAULT", "obstacle unknown": "FAULT", "solver stalled": "FAULT",
     "solver raises": "FAULT", "solver NaN": "FAULT", "solver false": "FAULT", "solver wild": "FAULT",
-    "network NaN": "FAULT",
+    "L_g phi = 0": "INFEASIBLE", "network NaN": "FAULT",
 }  # fmt: skip
 
 
 def test_every_fault_is_survived_on_its_level_of_the_ladder(tmp_path):
-    """Through the command: the Panda with the rate of a Franka, 1 N m per ms."""
-    done = CliRunner().invoke(app, ["faults", "panda", "sphere", "--effort-rate", "1000", "--json"])
+    """Through the command: the Panda with the rate of a Franka, 1 N m per ms, and springs that press on the ball."""
+    spec = tmp_path / "panda.yaml"
+    springs = "[56.4, 15.2, 39.8, 32.0, 4.57, 4.57, 5.99]"  # all that gravity and damping leave
+    facts = find_robot("panda").read_text() + "barrier: {gamma: 10.0}\n"
+    spec.write_text(facts + f"controller: {{type: bounded_spring, max_spring: {springs}}}\n")
+    done = CliRunner().invoke(app, ["faults", str(spec), "sphere", "--effort-rate", "1000", "--json"])
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     cases = {x["name"]: x for x in found["cases"]}

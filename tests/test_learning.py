@@ -398,18 +398,21 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     q, v = draw(two_link, 7, seed=2)
     joined: list[int] = []
     join = MarginDescent.add_counterexamples
-    monkeypatch.setattr(MarginDescent, "attack", lambda self, params: Attack(-0.25, q, v, 1234))
     monkeypatch.setattr(
         MarginDescent, "add_counterexamples", lambda self, q, v: (joined.append(len(q)), join(self, q, v))[1]
     )
     monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: pytest.fail("not needed"))
     notes: list[str] = []
-    _, result = train(two_link, on_refine=notes.append)
+    tried: list[int] = []  # candidates attacked until the refinement
+    real = Attack(-0.25, q, v, 1234)
+    calls: list[int] = []
+    monkeypatch.setattr(MarginDescent, "attack", lambda self, params: (calls.append(1), real)[1])
+    _, result = train(two_link, on_refine=lambda note: (notes.append(note), tried.append(len(calls))))
     assert not result.converged
     assert result.reason == "the falsifier found 7 states without a feasible torque, the worst margin -0.250"
     assert notes == [f"{result.reason}: refining"]
     (states,) = filter(None, joined)  # at the refinement, and none at the checks
-    assert states in {7 * n for n in range(1, CANDIDATES + 1)}
+    assert 1 <= tried[0] <= CANDIDATES and states == 7 * tried[0]
     report = result.report()
     assert (report["worst_margin"], report["attacked"], report["samples"]) == (-0.25, 1234, 0)
     assert json.loads(json.dumps(report, allow_nan=False)) == report

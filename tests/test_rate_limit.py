@@ -143,8 +143,9 @@ def inequalities(problem, rows, dyn, config, fastest):
     return A, lower
 
 
-def test_the_answer_is_the_least_correction_within_the_rate(panda, states):
+def test_the_answer_is_the_least_correction_within_the_rate(brisk_panda, states):
     """Against an active-set solver that is given every row and the same bounds; and infeasible where it says so."""
+    panda = brisk_panda
     model, config, rate = panda.model, FilterConfig(), 0.3 * panda.model.u_max
     qp_filter = QPFilter(panda.barrier("lb-cbf"), panda.safety, config, np.full(7, RATE))
     fastest, seen = RATE / model.u_max.max(), dict.fromkeys(Status, 0)
@@ -165,7 +166,7 @@ def test_the_answer_is_the_least_correction_within_the_rate(panda, states):
         assert whole == z.found
         if z.found:
             np.testing.assert_allclose(answer.u, nominal.u + z.x * model.u_max, atol=1e-5 * model.u_max.max())
-    assert seen[Status.CORRECTING] > 10 and seen[Status.INFEASIBLE] > 10 and seen[Status.PASSIVITY_DROPPED] > 0
+    assert seen[Status.CORRECTING] > 30 and seen[Status.INFEASIBLE] > 10 and seen[Status.PASSIVITY_DROPPED] > 0
 
 
 def test_out_of_reach_the_worst_row_is_as_good_as_the_rate_allows(cartpole, states):

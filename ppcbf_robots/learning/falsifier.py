@@ -1,10 +1,10 @@
 """Search for band states without a feasible torque for the runtime filter: many small evolution strategies at once.
 
 The margin is a function of q, of the direction d of v and of the level of phi, between the filter's own margin and
-epsilon; the speed follows. It has kinks (another
-row, another vertex of the box), where gradients lead astray: every start draws points about itself instead, some in all
-coordinates, some in a few, and some where it last went, and moves to the best. Those that fall behind the others give
-way to fresh ones. The same number of points finds some twenty times as many states as differences and gradients do.
+epsilon; the speed follows. It has kinks (another row, another vertex of the box), where gradients lead astray: every
+start draws points about itself instead, some in all coordinates, some in a few, and some where it last went, and moves
+to the best. Those that fall behind the others give way to fresh ones. The same number of points finds some twenty times
+as many states as differences and gradients do.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FIRST_STEP, LARGEST_STEP = 0.02, 0.1  # of X's width
 LAST_STEP = 2e-4  # below which a start is given up and replaced
 LONGER, SHORTER = 1.25, 0.85  # factors on the step after a better point, and after none
 CULLING = 20  # rounds after which ...
-CULLED = 0.33  # ... this share of the starts, the best margins, is replaced if as old
+CULLED = 0.33  # ... this share of the starts, those of the largest margins, is replaced if as old
 
 
 @dataclass(frozen=True)
