@@ -17,6 +17,8 @@ SPRING_RATE = 4.0  # [1/s], K_p / K_d: the rate at which a heavily damped joint 
 DT = 1e-3  # [s], control period the derived damping must suit
 DAMPING_LIMIT = 0.7  # of λ_max(M⁻¹ K_d) dt; 1 would overshoot within one period
 WIDE_TURN = np.pi  # [rad], half range given to joints without position limits
+CORNERED = 0.25  # of the joints run into a bound, in states drawn so
+CLOSE = 1.5  # times |v| / gamma: the largest distance from it
 
 
 class Domain:
@@ -32,6 +34,18 @@ class Domain:
     def sample_v(self, rng: np.random.Generator, count: int) -> Array:
         """Uniform velocities (count, nv)."""
         return rng.uniform(self.v[:, 0], self.v[:, 1], (count, len(self.v)))
+
+    def sample_cornered(self, rng: np.random.Generator, count: int, gamma: float) -> tuple[Array, Array]:
+        """States, angles and velocities (count, nv) each, of which some joints run into a bound of X.
+
+        Every joint does with a probability of 1/4, so close to its bound that ``gamma h + ḣ`` is small; the rest is
+        uniform. Several rows meet there more often than at uniform states.
+        """
+        q, v = self.sample_q(rng, count), self.sample_v(rng, count)
+        bound = np.where(v >= 0.0, self.q[:, 1], self.q[:, 0])
+        close = bound - rng.uniform(0.0, CLOSE, q.shape) * v / gamma
+        near = rng.random(q.shape) < CORNERED
+        return np.where(near, np.clip(close, self.q[:, 0], self.q[:, 1]), q), v
 
 
 def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:

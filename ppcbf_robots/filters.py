@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
 from ppcbf_robots.condense import condense, hessian, hold_at, inside, nearest, pick, verify
+from ppcbf_robots.cutting_planes import shortfall_and_cut, together
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -38,6 +39,8 @@ ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is chec
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
 LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
 FAST_SHARE = 0.5  # of the way to a bound that one control period may go, where acting late costs nothing
+CUTS = 3  # times that a torque is asked for again because of what K does over the period
+SHORT = 0.4  # of alpha margin, by which a row may fall short over the period: phi still settles above 0
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, an arm counts as at rest
 FREE_POWER = 2e-3  # of u_max · v_max, by which a correction may exceed d_p: near rest (9) cannot hold exactly
 GAMMA_PER_RATE = 2.0  # times the least rate / u_max: with more, rows were infeasible in trials
@@ -246,6 +249,9 @@ class QPFilter:
     afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
     solution, the velocity domain is given up first, then passivity; then the least violation is sought.
 
+    Where K_theta is convex in v, a torque that lets K rise further by the end of the control period than its rate says
+    is asked for again with K's tangent there (see :mod:`ppcbf_robots.cutting_planes`), as long as a solution is found.
+
     Under a limited rate no class-K gain is above the least ``rate / u_max`` of all joints: a row that comes into force
     faster than a torque can be built up finds no solution, and what then follows throws the arm about.
 
@@ -262,6 +268,8 @@ class QPFilter:
         self.barrier, self.safety, self.config = barrier, safety, config
         self.fastest = np.inf if rate is None else slowest_joint(safety.robot, rate)
         self.solver: QPSolver = make_solver(config.solver)
+        network = getattr(barrier, "network", None)
+        self._convex = network if network is not None and network.kind == "convex" else None
 
     def _class_k(self, limited: bool) -> tuple[float, float, float, float]:
         """Class-K gains [1/s]: of the barrier's rows, added where pairs separate, of the velocity domain; margin."""
@@ -309,6 +317,29 @@ class QPFilter:
 
         ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
         """
+        answer = self._once(dyn, rows, u_des, d_p, u_max, allowed)
+        if answer.status is not Status.CORRECTING or self._convex is None:
+            return answer
+        alpha, release, _, margin = self._class_k(allowed is not None)
+        bound = alpha * (rows.phi - margin) + release * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+        every = rows
+        for _ in range(CUTS):
+            short, cut = shortfall_and_cut(self._convex, dyn, safety, rows, answer.u, self.config.dt)
+            if np.min(rows.psi(answer.u) + bound) - short >= -SHORT * alpha * margin:
+                break
+            every = together(every, cut)
+            again = self._once(dyn, every, u_des, d_p, u_max, allowed)
+            if again.status is not Status.CORRECTING:
+                break
+            added = len(every.phi) - len(rows.phi)
+            k = again.row
+            answer = replace(again, row=k if k < 0 else k % len(rows.phi) if k < len(every.phi) else k - added)
+        return answer
+
+    def _once(
+        self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array, allowed: Box | None
+    ) -> Correction:
+        """The correction for rows whose psi is taken as it is."""
         qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max, allowed)
         if hold and np.all(qp.box[0] <= 0.0) and np.all(qp.box[1] >= 0.0):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)

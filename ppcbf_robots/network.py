@@ -60,7 +60,7 @@ def _sigmoid(xp: Any, x: Any) -> Any:
 
 
 def _softplus(xp: Any, x: Any) -> Any:
-    return xp.log1p(xp.exp(-xp.abs(x))) + xp.where(x > 0, x, xp.zeros_like(x))
+    return xp.log1p(xp.exp(-xp.abs(x))) + xp.clip(x, 0.0, None)
 
 
 def _mlp(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
@@ -113,12 +113,16 @@ def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
 def _speed_terms(xp: Any, p: Params, s: Any) -> tuple[Any, Any]:
     """F + G (...) of the scaled velocity s (..., nv) and their gradient (..., nv)."""
     cone_square, bowl_square = p["cone_b"] * p["cone_b"], p["bowl_b"] * p["bowl_b"]
-    cone_a, cone_c = _softplus(xp, p["cone_a"]), _softplus(xp, p["cone_c"])
-    root = xp.sqrt((cone_square * s * s).sum(-1) + cone_c * cone_c)
-    bowl_a, z = _softplus(xp, p["bowl_a"]), (bowl_square * s * s).sum(-1) - p["bowl_c"]
+    value, by_cone, by_bowl = _speed_value(xp, p, (cone_square * s * s).sum(-1), (bowl_square * s * s).sum(-1))
+    return value, (by_cone[..., None] * cone_square + by_bowl[..., None] * bowl_square) * s
+
+
+def _speed_value(xp: Any, p: Params, cone: Any, bowl: Any) -> tuple[Any, Any, Any]:
+    """F + G (...) of the squared lengths |s|² (...) that each sees, and twice its derivatives with respect to these."""
+    cone_a, cone_c, bowl_a = _softplus(xp, p["cone_a"]), _softplus(xp, p["cone_c"]), _softplus(xp, p["bowl_a"])
+    root, z = xp.sqrt(cone + cone_c * cone_c), bowl - p["bowl_c"]
     value = cone_a * (root - cone_c) + bowl_a * (_softplus(xp, z) - _softplus(xp, -p["bowl_c"]))
-    slopes = (cone_a / root)[..., None] * cone_square + (2.0 * bowl_a * _sigmoid(xp, z))[..., None] * bowl_square
-    return value, slopes * s
+    return value, cone_a / root, 2.0 * bowl_a * _sigmoid(xp, z)
 
 
 def _mlp_out(xp: Any, p: Params, q: Any, v: Any) -> Any:
@@ -141,11 +145,13 @@ def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> C
         return lambda s: (_mlp_out(xp, p, q, s[..., None] * d) - y0) ** 2
     a, c, b = _convex_units(xp, p, q)
     slope = (b * (d * p["v_scale"])[..., None, :]).sum(-1)
-    rest, tangent = _softplus(xp, c), _sigmoid(xp, c) * slope
+    rest, tangent = (a * _softplus(xp, c)).sum(-1), (a * _sigmoid(xp, c) * slope).sum(-1)
+    cone, bowl = ((p[f"{form}_b"] * d * p["v_scale"]) ** 2 for form in ("cone", "bowl"))
+    cone, bowl = cone.sum(-1), bowl.sum(-1)
 
     def K(s: Any) -> Any:
-        units = (a * (_softplus(xp, s[..., None] * slope + c) - rest - s[..., None] * tangent)).sum(-1)
-        return units + _speed_terms(xp, p, s[..., None] * d * p["v_scale"])[0]
+        units = (a * _softplus(xp, s[..., None] * slope + c)).sum(-1) - rest - s * tangent
+        return units + _speed_value(xp, p, s * s * cone, s * s * bowl)[0]
 
     return K
 

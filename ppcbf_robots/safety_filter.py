@@ -91,9 +91,12 @@ class SafetyFilter:
         self.gravity_included = gravity_included
         closed = self.config.kind == "closed-form"
         limit = self._rate(rate)
-        self.correction = ClosedForm(barrier, self.config) if closed else QPFilter(barrier, safety, self.config, limit)
         learned = isinstance(barrier, RhoBarrier)
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
+        self.correction, self._blind_correction = (
+            ClosedForm(b, self.config) if closed else QPFilter(b, safety, self.config, limit)
+            for b in (barrier, self._blind)
+        )
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
         self._last_status = Status.FREE
         config = self.config
@@ -267,7 +270,8 @@ class SafetyFilter:
         h, phi = float(rows.h.min()), float(rows.phi.min())
         pushed = moving and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
-        c = self._correct(dyn, safety, rows, wary, u_des + offset, budget, allowed)
+        correction = self._blind_correction if moving else self.correction
+        c = self._correct(correction, dyn, safety, rows, wary, u_des + offset, budget, allowed)
         if c.status is Status.FAULT:
             return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
         status = c.status
@@ -278,14 +282,14 @@ class SafetyFilter:
         return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
 
     def _correct(
-        self, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, wary: BarrierRows, u_des: Array, d_p: float | None,
-        allowed: Box | None,
+        self, correction: ClosedForm | QPFilter, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows,
+        wary: BarrierRows, u_des: Array, d_p: float | None, allowed: Box | None,
     ) -> Correction:  # fmt: skip
         """The correction that makes up for the slip of phi, or where that is too much to ask, the one that does not."""
         u_max = self.robot.u_max
-        c = self.correction.correct(dyn, safety, wary, u_des, d_p, u_max, allowed)
+        c = correction.correct(dyn, safety, wary, u_des, d_p, u_max, allowed)
         if wary is not rows and c.status >= Status.PASSIVITY_DROPPED:
-            plain = self.correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
+            plain = correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
             c = plain if plain.status < c.status else c
         return c
 

@@ -26,6 +26,7 @@ LAYERS = [
     ["safety", "controllers", "network", "engines", "plant", "pushes", "batch_dynamics"],
     ["condense", "ending"],
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
+    ["cutting_planes"],
     ["filters", "state_check", "slip"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],

@@ -409,7 +409,7 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     monkeypatch.setattr(MarginDescent, "attack", lambda self, params: (calls.append(1), real)[1])
     _, result = train(two_link, on_refine=lambda note: (notes.append(note), tried.append(len(calls))))
     assert not result.converged
-    assert result.reason == "the falsifier found 7 states without a feasible torque, the worst margin -0.250"
+    assert result.reason == "the falsifier found states of too little margin, the least -0.2500"
     assert notes == [f"{result.reason}: refining"]
     (states,) = filter(None, joined)  # at the refinement, and none at the checks
     assert 1 <= tried[0] <= CANDIDATES and states == 7 * tried[0]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from ppcbf_robots.filters import FilterConfig, free_power
-from ppcbf_robots.learning.critics import feasibility_margin
+from ppcbf_robots.learning.critics import Feasibility, feasibility
 from ppcbf_robots.learning.rays import Field, Rays
 from ppcbf_robots.network import NetworkKind, Params
 from ppcbf_robots.problem import Problem
@@ -57,13 +57,16 @@ class Band:
         v = s[:, None] * rays.d
         return Nominal(v, rays.u_rest - self.kd * v, (self.kd * v * v).sum(-1))
 
-    def margin(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> torch.Tensor:
-        """The QP's exact feasibility margin (B,), with the passivity row or without."""
+    def feasibility(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> Feasibility:
+        """The linear programs of the runtime QP's margin, with the passivity row or without."""
         rows, nominal = self.field.rows(params, rays, s), self.nominal(rays, s)
         wanted, budget = self.passive if passive is None else passive, nominal.d_p + self.free_power
-        margin: torch.Tensor = feasibility_margin(
-            rows, nominal.v, nominal.u_des, budget, self.u_max, self.config, wanted
-        )
+        return feasibility(rows, nominal.v, nominal.u_des, budget, self.u_max, self.config, wanted)
+
+    def margin(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> torch.Tensor:
+        """The QP's exact feasibility margin (B,), with the passivity row or without."""
+        programs = self.feasibility(params, rays, s, passive)
+        margin: torch.Tensor = programs.margin(programs.solve())
         return margin
 
     @torch.no_grad()

@@ -6,13 +6,13 @@ runtime QP, exact for any number of rows. Positive margins are good, positive cr
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.filters import FilterConfig, Metric
-from ppcbf_robots.learning.linear_program import best_worst_row
+from ppcbf_robots.learning.linear_program import Optimum, best_worst_row
 
 _TINY = 1e-9
 PASSIVITY_RESERVE = 0.01  # of |v| |u_sc|; more of it fights the torque critic
@@ -55,16 +55,36 @@ def closed_form_critics(
     return torque, passivity
 
 
-def feasibility_margin(
+class Feasibility(NamedTuple):
+    """The linear program of B states: rows ``offset + c z`` of R rows, ``|z_i| <= 1``, ``p z <= budget``."""
+
+    offset: Any  # (B, R)
+    c: Any  # (B, R, nv)
+    p: Any  # (B, nv)
+    budget: Any  # (B,)
+
+    def solve(self) -> Optimum:
+        """Multipliers and torques, without gradient."""
+        offset, c, p, budget = (x.detach() for x in self)
+        return best_worst_row(offset, c, p, budget.clamp(min=-1.0))
+
+    def margin(self, optimum: Optimum) -> Any:
+        """(B,), with the envelope theorem's gradient: the optimum, of these very states, is held fixed."""
+        share, z = optimum.share.to(self.c.dtype), optimum.z.to(self.c.dtype)
+        margin = (share * (self.offset + (self.c * z[..., None, :]).sum(-1))).sum(-1)
+        return torch.where(self.budget >= -1.0, margin, self.budget)
+
+
+def feasibility(
     rows: BarrierRows, v: Any, u_des: Any, d_p: Any, u_max: Any, config: FilterConfig, passive: bool
-) -> Any:
-    """Exact margin of the runtime QP's barrier rows, torque box and passivity row together, (B,).
+) -> Feasibility:
+    """The exact margin of the runtime QP's barrier rows, torque box and passivity row together, as a linear program.
 
     ``max_u min_k (psi_k(u) + alpha (phi_k - margin) + fast_alpha max(0, min(ḣ_k, phi_k))) / authority_k`` over
     ``|u| <= u_max``, ``vᵀ(u - u_des) <= d_p``, where
     ``authority_k = Σ_i |L_gφ_k,i| u_max,i`` makes it dimensionless. It is negative where the QP has no solution.
     Where not even the box alone allows the power, it is ``-1`` minus the power that is too much, relative to
-    ``|v| · u_max``. The gradient is the envelope theorem's: multipliers and torque of the optimum are held fixed.
+    ``|v| · u_max``.
 
     Args:
         rows: of B states.
@@ -83,7 +103,4 @@ def feasibility_margin(
     power = v * u_max
     scale = power.abs().sum(-1) + _TINY
     budget = ((v * u_des).sum(-1) + d_p) / scale if passive else torch.ones_like(d_p)
-    best = best_worst_row(offset.detach(), c.detach(), power / scale[..., None], budget.clamp(min=-1.0))
-    share, z = best.share.to(c.dtype), best.z.to(c.dtype)
-    margin = (share * (offset + (c * z[..., None, :]).sum(-1))).sum(-1)
-    return torch.where(budget >= -1.0, margin, budget)
+    return Feasibility(offset, c, power / scale[..., None], budget)

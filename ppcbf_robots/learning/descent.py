@@ -20,6 +20,7 @@ from ppcbf_robots.specs import Array
 
 LearnedKind = Literal["ncbf", "pp-ncbf"]
 CHECK_STATES = 4_000
+VOLUME_STATES = 20_000  # uniform states of X on which the volume is measured
 LAST_RATE = 0.1  # of the learning rate, at the end of the planned iterations
 
 
@@ -74,8 +75,8 @@ class Descent(ABC):
         """What is asked for becomes stricter, since the evidence found violations."""
 
     @abstractmethod
-    def attack(self, params: dict[str, Array]) -> Attack | None:
-        """A search for violating states of given parameters; None where there is none."""
+    def attack(self, params: dict[str, Array], known: Attack | None) -> Attack | None:
+        """A search for violating states of given parameters, with those known of others; None where there is none."""
 
     @abstractmethod
     def state(self) -> tuple[Tensors, dict[str, Any]]:
@@ -98,7 +99,8 @@ class Descent(ABC):
             )
         pool = Rays(**to_tensors(rays, self.device, self.dtype))
         gamma = self.problem.robot.spec.barrier.gamma
-        return pool.without_far_rows(gamma), VolumeStates(**to_tensors(volume, self.device, self.dtype))
+        states = {k: x[:VOLUME_STATES] for k, x in to_tensors(volume, self.device, self.dtype).items()}
+        return pool.without_far_rows(gamma), VolumeStates(**states)
 
     def rays_through(self, q: Array, v: Array) -> Rays:
         """Rays through the states (q, v) that are free of collision."""

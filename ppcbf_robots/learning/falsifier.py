@@ -44,7 +44,7 @@ class Attack:
     """What a search found."""
 
     worst: float  # least margin seen
-    q: Array  # (found, nq) states with a negative margin
+    q: Array  # (found, nq) states whose margin is below what was asked for
     v: Array  # (found, nv)
     evaluated: int
 
@@ -61,7 +61,7 @@ class Starts:
 
 
 class Falsifier:
-    """Searches for states of negative margin.
+    """Searches for states of small margin.
 
     Args:
         problem: robot, world and controller, with the gamma of the barrier.
@@ -113,12 +113,15 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Starts | None = None,
         enough: float = float("inf"),
+        below: float = 0.0,
     ) -> Attack:
         """Descend until rounds or seconds are used up, or ``enough`` states of negative margin were found.
 
+        States of a margin less than ``below`` come back.
+
         ``starts`` of an earlier search, with other parameters or not, go on and are changed in place.
         """
-        began, done, found = time.monotonic(), 0, _Found()
+        began, done, found = time.monotonic(), 0, _Found(below)
         if starts is None:
             starts = self.start()
         known = starts.step > 0.0
@@ -132,7 +135,7 @@ class Falsifier:
                 old = np.flatnonzero(starts.age >= CULLING)
                 behind = old[np.argsort(-starts.value[old])][: int(CULLED * STARTS)]
                 over[behind] = True
-                over[old[starts.value[old] < 0.0]] = True  # elsewhere there may be others
+                over[old[starts.value[old] < below]] = True  # elsewhere there may be others
             self._replace(params, starts, over, found)
         return found.attack(self.problem.model.nq, self.problem.model.nv)
 
@@ -142,11 +145,18 @@ class Falsifier:
         count = int(over.sum())
         if not count:
             return
-        points = self.rng.uniform(self._low, self._high, (FRESH * count, len(self._low)))
+        points = self._drawn(FRESH * count)
         value = found.add(*self.margins(params, points))
         worst = np.argsort(value)[:count]
         starts.points[over], starts.value[over] = points[worst], value[worst]
         starts.step[over], starts.drift[over], starts.age[over] = FIRST_STEP, 0.0, 0
+
+    def _drawn(self, count: int) -> Array:
+        """Random points: half of them uniform, half with joints that run into bounds of X."""
+        points, cornered = self.rng.uniform(self._low, self._high, (count, len(self._low))), count // 2
+        domain, gamma = self.problem.robot.domain, self.problem.robot.spec.barrier.gamma
+        points[:cornered, :-1] = np.concatenate(domain.sample_cornered(self.rng, cornered, gamma), axis=1)
+        return points
 
     def _descend(self, params: Mapping[str, torch.Tensor], starts: Starts, found: _Found) -> None:
         """One round: probes about every start, of which the best takes its place if it is better."""
@@ -168,21 +178,21 @@ class Falsifier:
 
 
 class _Found:
-    """States of negative margin among all that were judged."""
+    """States of small margin among all that were judged."""
 
-    def __init__(self) -> None:
-        self.worst, self.judged, self.states = float("inf"), 0, 0
+    def __init__(self, below: float) -> None:
+        self.below, self.worst, self.judged, self.states = below, float("inf"), 0, 0
         self._q: list[Array] = []
         self._v: list[Array] = []
 
     def add(self, margin: Array, q: Array, v: Array) -> Array:
         """Take note of states, and return their margins."""
-        bad = margin < 0.0
+        bad = margin < self.below
         self.worst, self.judged = min(self.worst, float(margin.min(initial=np.inf))), self.judged + len(margin)
         if bad.any():
             self._q.append(q[bad])
             self._v.append(v[bad])
-            self.states += int(bad.sum())
+            self.states += int((margin < 0.0).sum())
         return margin
 
     def attack(self, nq: int, nv: int) -> Attack:

@@ -27,6 +27,10 @@ class Optimum(NamedTuple):
     share: torch.Tensor  # (B, R) multipliers λ of the rows, summing to 1
     z: torch.Tensor  # (B, n)
 
+    def select(self, index: torch.Tensor) -> Optimum:
+        """Those of some programs."""
+        return Optimum(*(x[index] for x in self))
+
 
 @torch.no_grad()
 def best_worst_row(offset: torch.Tensor, c: torch.Tensor, p: torch.Tensor, budget: torch.Tensor) -> Optimum:

@@ -2,7 +2,7 @@
 
 The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The
 first term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions
-weigh as much as fast ones. Of the second, half the states are drawn where the margin was smallest so far. The third
+weigh as much as fast ones. Of the second, half the states are drawn where the margin was small so far. The third
 keeps K from answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing
 violates, the weight grows and the set with it. At every check the surroundings of the smallest margins are explored
 with new rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
@@ -24,19 +24,21 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 AVERAGING = 0.03  # of the parameters per iteration, in the average that checks and evidence look at
-NEAR = 0.1  # above the wanted margin: rays below it are drawn as often as all others together
+NEAR = 0.1  # above the wanted margin: rays below it, by what they lack, are drawn as often as all others together
 FAR_AWAY = 1.0  # margin noted for rays that do not cross the band
-EXPLORED = 1_600  # new rays per check, around those of small margin
+EXPLORED = 1_600  # new rays per check around those of small margin, and as many with joints that run into bounds
 SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
 POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.5  # factor on the wanted margin per refinement
+STRICTER = 1.25  # factor on the wanted margin per refinement
 MIN_MARGIN, MAX_MARGIN = 0.01, 0.3
-SIMPLER = 1.5  # factor on the penalty of what depends on q, per refinement
-TAKEN = 300  # states at most that join from one search
-HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
+SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
+TAKEN = 1_500  # states at most that join from one search
+ENOUGH = 300  # violating states that end the evidence's search
+RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
+HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
 class MarginDescent(Descent):
@@ -49,7 +51,7 @@ class MarginDescent(Descent):
         self.margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
         self._hunt = self.falsifier.start()  # goes on from check to check
         self._first_pool = len(self.rays)
-        self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
+        self._max_weight, self._simplicity = preset.volume_weight / self._joints**2, preset.simplicity
         self._weight: torch.Tensor = torch.tensor(self._max_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
         self.judged = {k: x.detach().clone() for k, x in self.params.items()}
@@ -65,7 +67,7 @@ class MarginDescent(Descent):
         index, s, _ = self.sample(count, self._crossing)
         drawn = len(index)
         if len(self._near):
-            near, s_near, _ = self.sample(count, self._near)
+            near, s_near, _ = self.sample(count, self._near[self._urgent(count)])
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
@@ -73,13 +75,15 @@ class MarginDescent(Descent):
         rays = self.rays.select(index)
         self.evaluated += len(index)
         with torch.no_grad():
-            margin = self.band.margin(self.params, rays, s)
-            self._noted[index] = margin
+            programs = self.band.feasibility(self.params, rays, s)
+            optimum = programs.solve()
+            self._noted[index] = margin = programs.margin(optimum)
         shrinkage, unrest = self._shrinkage(rays.select(slice(drawn)), s[:drawn])
         loss = self._weight * shrinkage + self._simplicity * unrest
         short = (margin < self.margin).nonzero()[:, 0]  # the others have no gradient
         if len(short):
-            wanting = torch.relu(self.margin - self.band.margin(self.params, rays.select(short), s[short]))
+            programs = self.band.feasibility(self.params, rays.select(short), s[short])
+            wanting = torch.relu(self.margin - programs.margin(optimum.select(short)))
             loss = loss + wanting.sum() / len(index) + self.preset.worst_weight * wanting.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -91,6 +95,12 @@ class MarginDescent(Descent):
         violated = (margin[:drawn] < 0.0).to(self.dtype).mean() > VIOLATED
         factor = torch.where(violated, WEIGHT_FALL, WEIGHT_GROWTH)
         self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
+
+    def _urgent(self, count: int) -> torch.Tensor:
+        """Indices into the rays of small margin, drawn in proportion to what each was last seen to lack."""
+        lacking = (NEAR + self.margin - self._noted[self._near]).clamp(min=1e-3).cumsum(0)
+        at = torch.rand(count, generator=self.generator).to(self.device, self.dtype) * lacking[-1]
+        return torch.searchsorted(lacking, at).clamp(max=len(lacking) - 1)
 
     def _shrinkage(self, rays: Rays, s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean of -log s*, of the boundary's s* on each ray, and the mean square of K's change along the motion.
@@ -107,10 +117,10 @@ class MarginDescent(Descent):
     def check(self) -> tuple[float, float, float]:
         """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
         found = self._explore()
-        self._look()
-        attack = self.falsifier.search(self.judged, rounds=self.preset.search_rounds * self._joints, starts=self._hunt)
+        attack = self.falsifier.search(
+            self.judged, self.preset.search_rounds * self._joints, starts=self._hunt, below=self.margin
+        )
         self.add_counterexamples(attack.q, attack.v)
-        self._join(self._hunted())
         self._look()
         with torch.no_grad():
             index, s, crosses = self.sample(CHECK_STATES, params=self.judged)
@@ -119,7 +129,7 @@ class MarginDescent(Descent):
             rays = self.rays.select(index)
             fails = self.band.margin(self.judged, rays, s) < 0.0
             alone = self.band.margin(self.judged, rays, s, passive=False) < 0.0
-            torque = max(float(alone.float().mean()), found, float(len(attack.q) > 0) / CHECK_STATES)
+            torque = max(float(alone.float().mean()), found, float(attack.worst < 0.0) / CHECK_STATES)
             return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
 
     @torch.no_grad()
@@ -133,13 +143,8 @@ class MarginDescent(Descent):
             self._noted[new] = self.band.least_margin(self.params, self.rays.select(new))[0].clamp(max=FAR_AWAY)
         self._near = (crossing & (self._noted < NEAR + self.margin)).nonzero()[:, 0]
 
-    def _hunted(self) -> Rays:
-        """Rays on which the falsifier now sees less than the margin wanted."""
-        points, nv = self._hunt.points[self._hunt.value < self.margin], self.problem.model.nv
-        return self.rays_through(self.problem.model.from_angles(points[:, :nv]), points[:, nv:-1])
-
     def _explore(self) -> float:
-        """New rays about those of least margin; the share of them that violate."""
+        """New rays about those of least margin, and where joints run into bounds; the share of them that violate."""
         near, count = self._near, EXPLORED // 4
         chosen = (
             near[torch.randint(len(near), (count // 2,), generator=self.generator).to(self.device)]
@@ -151,12 +156,14 @@ class MarginDescent(Descent):
         domain, model = self.problem.robot.domain, self.problem.model
         angles = np.repeat(model.to_angles(old.q.cpu().double().numpy()), 4, 0)
         d = np.repeat(old.d.cpu().double().numpy(), 4, 0)
-        if not len(d):
-            return 0.0
         size = np.exp(self.rng.uniform(np.log(SPREAD[0]), np.log(SPREAD[1]), (len(d), 1)))
         angles = angles + size * self.rng.normal(size=d.shape) * np.ptp(domain.q, axis=1)
         d = d + size * self.rng.normal(size=d.shape) * np.ptp(domain.v, axis=1)
+        cornered, into = domain.sample_cornered(self.rng, EXPLORED, self.band.field.gamma)
+        angles, d = np.concatenate([angles, cornered]), np.concatenate([d, into])
         rays = self.rays_through(model.from_angles(np.clip(angles, domain.q[:, 0], domain.q[:, 1])), d)
+        if not len(rays):
+            return 0.0
         least = self.band.least_margin(self.judged, rays)[0]
         small = (least < NEAR + self.margin).nonzero()[:, 0]
         self._join(rays.select(small), least[small])
@@ -174,10 +181,15 @@ class MarginDescent(Descent):
             )
             self.rays, self._noted = self.rays.select(kept), self._noted[kept]
 
-    def attack(self, params: dict[str, Array]) -> Attack:
-        """The falsifier's search against given parameters, until it has as many states as can join."""
+    def attack(self, params: dict[str, Array], known: Attack | None) -> Attack:
+        """See :meth:`Descent.attack`; states that are known and violate these parameters too make a search needless."""
         tensors = {k: self._tensor(x) for k, x in params.items()}
-        return self.falsifier.search(tensors, rounds=self.preset.attack_rounds * self._joints, enough=TAKEN)
+        if known is not None and len(known.q):
+            least = self.band.least_margin(tensors, self.rays_through(known.q, known.v))[0].cpu().numpy()
+            if least.min() < 0.0:
+                return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
+        rounds = self.preset.attack_rounds * self._joints
+        return self.falsifier.search(tensors, rounds=rounds, enough=ENOUGH, below=RESERVE)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""

@@ -90,7 +90,7 @@ class Tested:
 
     @property
     def failures(self) -> int:
-        """Violating states found in either way."""
+        """Violating states found in either way, and those that come too close to it."""
         return self.check.violations + (0 if self.attack is None else len(self.attack.q))
 
     @property
@@ -203,27 +203,25 @@ class Trainer:
 
     def _evidence(self) -> list[Tested]:
         """Judge the largest clean candidates by the falsifier and by the filter on uniform states, until one stands."""
-        tested = []
+        tested: list[Tested] = []
         for volume, params in self.clean:
-            attack = self.descent.attack(params)
-            if attack is not None and len(attack.q):
+            attack = self.descent.attack(params, tested[-1].attack if tested else None)
+            if attack is not None and attack.worst < 0.0:
                 tested.append(Tested(params, BandCheck(0, 0, 0), attack, volume))
                 continue
-            check = self._draw_check(params)
+            check = self._draw_check(params, self.preset.test_samples // 5)
             if check.samples and not check.violations:  # selected by this draw, so only a fresh one is evidence
-                check = self._draw_check(params)
+                check = self._draw_check(params, self.preset.test_samples)
             if check.samples:
                 tested.append(Tested(params, check, attack, volume))
             if tested and tested[-1].clean:
                 break
         return tested
 
-    def _draw_check(self, params: dict[str, Array]) -> BandCheck:
+    def _draw_check(self, params: dict[str, Array], count: int) -> BandCheck:
         barrier = self.problem.barrier(self.kind, NumpyNetwork(self.preset.network, params))
         passive = self.kind == "pp-ncbf"
-        return check_band(
-            self.problem, barrier, self.filter_config, self.preset.test_samples, self.descent.rng, passive
-        )
+        return check_band(self.problem, barrier, self.filter_config, count, self.descent.rng, passive)
 
     def _refine(self, tested: list[Tested]) -> None:
         """Violating states join, the descent asks for more, and training goes on for a while."""
@@ -249,7 +247,7 @@ class Trainer:
             reason = f"no clean barrier was found: the safe set keeps {volume:.1%} of the LB set"
         elif check.samples < MIN_SAMPLES:
             reason = f"only {check.samples} states were found on the band, too few to tell"
-        elif best.failures:
+        elif best.check.violations:
             reason = _said(best)
         elif not start_inside and self.problem.safety.least(self.problem.robot.start)[0] >= 0.0:
             reason = "the start state lies outside the safe set"
@@ -266,7 +264,7 @@ def _said(tested: Tested) -> str:
     check, attack = tested.check, tested.attack
     if check.violations or attack is None:
         return f"{check.violations} of {check.samples} uniform band states violate the limits"
-    return f"the falsifier found {len(attack.q)} states without a feasible torque, the worst margin {attack.worst:.3f}"
+    return f"the falsifier found states of too little margin, the least {attack.worst:.4f}"
 
 
 def with_gamma(problem: Problem, preset: Preset) -> Problem:

@@ -1,0 +1,76 @@
+"""Tangents of K at the end of a control period: exact there, never too strict, and used by the QP where they matter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ppcbf_robots import filters
+from ppcbf_robots.cutting_planes import shortfall_and_cut, together
+from ppcbf_robots.filters import FilterConfig, QPFilter, Status
+
+DT = 1e-3
+
+
+def state(problem, barrier, q, v):
+    dyn = problem.model.evaluate(q, v)
+    safety = problem.safety.evaluate(dyn)
+    return dyn, safety, barrier.rows(dyn, safety)
+
+
+def rise(network, dyn, u):
+    """Change of K over one period at a fixed q, divided by it."""
+    end = dyn.v + DT * dyn.Minv @ (u - dyn.b)
+    return (network.value(dyn.q, end) - network.value(dyn.q, dyn.v)) / DT
+
+
+def test_the_tangent_touches_K_at_the_end_of_the_period_and_lies_below_it_elsewhere(problem, states, make_barrier):
+    barrier, rng = make_barrier(problem, "pp-ncbf-convex"), np.random.default_rng(0)
+    u_max = problem.model.u_max
+    for q, v in states(problem, 40):
+        dyn, safety, rows = state(problem, barrier, q, v)
+        u, other = rng.uniform(-1.0, 1.0, (2, problem.model.nv)) * u_max
+        short, cut = shortfall_and_cut(barrier.network, dyn, safety, rows, u, DT)
+        slope = barrier.network.value_and_grad(q, v)[2]
+
+        def true_psi(torque, dyn=dyn, rows=rows, slope=slope):
+            linear = slope @ dyn.Minv @ (torque - dyn.b)
+            return rows.psi(torque) + linear - rise(barrier.network, dyn, torque)
+
+        scale = 1e-6 * (1.0 + np.abs(rows.psi(u)).max())
+        assert short >= -scale
+        np.testing.assert_allclose(rows.psi(u) - short, true_psi(u), atol=scale)
+        np.testing.assert_allclose(cut.psi(u), true_psi(u), atol=scale)
+        assert np.all(cut.psi(other) >= true_psi(other) - scale)
+        assert len(together(rows, cut).phi) == 2 * len(rows.phi)
+
+
+def falls_short(problem, barrier, config, count):
+    """By how much each correction lets a row fall short by the end of the period [m/s²], with K's true rise."""
+    runtime, rng, found = QPFilter(barrier, problem.safety, config), np.random.default_rng(1), []
+    domain, u_max = problem.robot.domain, problem.model.u_max
+    for angles, v in zip(domain.sample_q(rng, count), 0.03 * domain.sample_v(rng, count), strict=True):
+        dyn, safety, rows = state(problem, barrier, problem.model.from_angles(angles), v)
+        if not 0.0 <= rows.phi.min() <= 0.3:
+            continue
+        u_des = dyn.g + rng.uniform(-0.5, 0.5, problem.model.nv) * u_max
+        answer = runtime.correct(dyn, safety, rows, u_des, None, u_max)
+        assert -1 <= answer.row < len(problem.safety.names)
+        if answer.status is Status.CORRECTING and "given up" not in answer.reason:
+            short, _ = shortfall_and_cut(barrier.network, dyn, safety, rows, answer.u, config.dt)
+            separating = np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+            bound = config.alpha * (rows.phi - config.margin) + config.fast_alpha * separating
+            found.append(short - float((rows.psi(answer.u) + bound).min()))
+    return np.array(found)
+
+
+def test_corrections_keep_the_rows_with_the_K_that_the_period_ends_with(two_link, make_barrier, monkeypatch):
+    """With tangents, up to what the margin covers; without them, K's kink lets rows fall short by far more."""
+    barrier, config = make_barrier(two_link, "pp-ncbf-convex"), FilterConfig()
+    barrier.network.params |= {"cone_a": np.array(0.0), "cone_c": np.array(-8.0)}  # a sharp kink at rest
+    tolerated = filters.SHORT * config.alpha * config.margin
+    found = falls_short(two_link, barrier, config, 600)
+    monkeypatch.setattr(filters, "CUTS", 0)
+    without = falls_short(two_link, barrier, config, 600)
+    print(len(found), np.mean(found > 1.1 * tolerated), np.mean(without > 1.1 * tolerated), without.max(), found.max())
+    assert len(found) > 20
+    assert np.mean(found > 1.1 * tolerated) < 0.1 < 0.3 < np.mean(without > 1.1 * tolerated)
