@@ -25,7 +25,7 @@ from ppcbf_robots.specs import BarrierSpec, Positive, Spec, validate
 
 log = logging.getLogger(__name__)
 
-FORMAT = 3
+FORMAT = 4
 KEYS = {"kind": str, "network": str, "formula": dict, "filter": dict, "fingerprint": dict, "weights_sha256": str,
         "robot": str, "world": str, "joints": list, "training": dict}  # fmt: skip
 PACKAGES = ("ppcbf-robots", "pin", "numpy", "torch", "proxsuite")
@@ -188,6 +188,8 @@ def _shapes_fit(kind: NetworkKind, params: Params, nv: int) -> bool:
         shapes |= {"ba": (units,), "bb": (units * nv,), "bc": (units,), "v_scale": (nv,)}
         for form in ("cone", "bowl"):
             shapes |= {f"{form}_a": (), f"{form}_b": (nv,), f"{form}_c": ()}
+        if "energy_a" in params:
+            shapes |= {"energy_a": (), "energy_scale": ()}
     return nv <= nq <= 2 * nv and {name: w.shape for name, w in params.items()} == shapes
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ppcbf_robots.barriers import BarrierRows
+from ppcbf_robots.barriers import BarrierRows, K_at
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.robot import Dynamics
 from ppcbf_robots.safety import SafetyRows
@@ -34,8 +34,7 @@ def shortfall_and_cut(
         that of ``rows`` by K's change over the period, divided by dt, instead of ``∂K/∂v · v̇``.
     """
     acceleration = dyn.Minv @ (u - dyn.b)
-    K, slope = network.value_and_grad(dyn.q, dyn.v)[::2]
-    K_end, _, slope_end = network.value_and_grad(dyn.q, dyn.v + dt * acceleration)
+    (K, slope), (K_end, slope_end) = (K_at(network, dyn, v) for v in (dyn.v, dyn.v + dt * acceleration))
     rise = (K_end - K) / dt
     w = rows.w - (slope_end - slope)
     Lg = w @ dyn.Minv

@@ -71,18 +71,25 @@ def uniform_band(
 
 
 def least_phi(problem: Problem, barrier: Barrier, q: Array, h: Array, grad: Array, v: Array) -> Array:
-    """min_k phi_k at velocities v (B, V, nv) of configurations q (B, nq); needs no dynamics for rho barriers.
+    """min_k phi_k at velocities v (B, V, nv) of configurations q (B, nq), for rho barriers.
 
-    Where rho < 0, rho itself may be returned: K >= 0 only takes away from it, and the network is what takes time.
+    Where it is negative, some of K may be missing: K >= 0 only takes away from it, and is what takes time.
     """
     network = getattr(barrier, "network", None)
     phi = np.asarray((v @ grad.transpose(0, 2, 1) + barrier.spec.gamma * h[:, None, :]).min(axis=-1))
     if network is None:
         return phi
     if network.kind == "convex":  # its layers see q alone: once per configuration
-        return np.asarray(phi - network.value(q[:, None], v))
+        phi = np.asarray(phi - network.value(q[:, None], v))
+    else:
+        b, i = np.nonzero(phi >= 0.0)
+        phi[b, i] -= network.value(q[b], v[b, i])
     b, i = np.nonzero(phi >= 0.0)
-    phi[b, i] -= network.value(q[b], v[b, i])
+    if network.energy and len(b):
+        chosen, index = np.unique(b, return_inverse=True)
+        M = problem.model.evaluate_batch(q[chosen], np.zeros((len(chosen), problem.model.nv))).M[index]
+        moving = v[b, i]
+        phi[b, i] -= 0.5 * network.energy * (moving * (M @ moving[..., None])[..., 0]).sum(-1)
     return phi
 
 

@@ -2,8 +2,8 @@
 
 The caller's own kinematics gives one row of the safety function; the file gives the barrier built on it:
 
-* in: q (nq,) in Pinocchio's coordinates (a continuous joint is cos, sin), v (nv,) [rad/s | m/s], the row's value h [m]
-  and its gradient grad_h (nv,) with respect to the joint velocity coordinates;
+* in: q (nq,) in Pinocchio's coordinates (a continuous joint is cos, sin), v (nv,) [rad/s | m/s], momentum (nv,)
+  ``M(q) v``, the row's value h [m] and its gradient grad_h (nv,) with respect to the joint velocity coordinates;
 * out: ``phi = grad_h·v + gamma h - K(q, v)`` [m/s], K [m/s], dphi_dv = w = grad_h - ∂K/∂v (nv,), which gives
   ``L_g phi = wᵀ M⁻¹``, and dK_dq (nq,), the learned part of ∂phi/∂q.
 
@@ -31,7 +31,7 @@ from ppcbf_robots.network import NetworkKind, value_and_grad
 ExportFormat = Literal["npz", "onnx", "c"]
 
 ONNX_OPSET = 17  # oldest that has every operator in float64
-INPUTS = ("q", "v", "h", "grad_h")
+INPUTS = ("q", "v", "momentum", "h", "grad_h")
 OUTPUTS = ("phi", "K", "dphi_dv", "dK_dq")
 
 _HIDDEN = "x <- elu(x W_i + b_i) for every hidden layer i, where elu(x) = x if x > 0 else exp(x) - 1"
@@ -54,9 +54,10 @@ _K_FORMULA: dict[NetworkKind, tuple[str, ...]] = {
     ),
 }
 _PHI_FORMULA = (
-    "phi = grad_h . v + gamma h - K(q, v)",
-    "w = dphi_dv = grad_h - dK/dv,  L_g phi = w^T M^-1",
-    "dphi/dt = v^T hessian(h) v + gamma grad_h . v - dK_dq . dq/dt + w^T M^-1 (u - C v - g)",
+    "energy = softplus(energy_a) energy_scale, or 0 without them; momentum = M v",
+    "phi = grad_h . v + gamma h - K,  where K is the one above plus energy 1/2 v . momentum",
+    "w = dphi_dv = grad_h - dK/dv - energy momentum,  L_g phi = w^T M^-1",
+    "dphi/dt = v^T hessian(h) v + gamma grad_h . v - dK_dq . dq/dt - energy v . C v + w^T M^-1 (u - C v - g)",
     "dq/dt = v, but (-sin, cos) v for the (cos, sin) of a continuous joint",
     "a filter with class-K gain alpha keeps dphi/dt >= -alpha phi",
 )
@@ -107,6 +108,7 @@ def describe(stored: StoredBarrier) -> dict[str, Any]:
         **origin,
         "gamma": stored.spec.gamma,
         "alpha": alpha,
+        "energy": network.energy,
         "nq": nq,
         "nv": nv,
         "joints": joints,
@@ -119,6 +121,8 @@ def describe(stored: StoredBarrier) -> dict[str, Any]:
             "phi": "m/s (rad/s for the limit of a rotary joint)",
             "gamma": "1/s",
             "alpha": "1/s",
+            "energy": "m/(s J)",
+            "momentum": "kg m^2/s | kg m/s",
             "domain": "q in rad | m, one angle per joint; v in rad/s | m/s",
         },
         "formula": [*_K_FORMULA[network.kind], *_PHI_FORMULA],
@@ -179,11 +183,13 @@ def _trace(stored: StoredBarrier, nq: int, nv: int) -> bytes:
             return torch.sin(x + 0.5 * math.pi)
 
     class Phi(torch.nn.Module):
-        def forward(self, q: Any, v: Any, h: Any, grad_h: Any) -> tuple[Any, ...]:
+        def forward(self, q: Any, v: Any, momentum: Any, h: Any, grad_h: Any) -> tuple[Any, ...]:
             K, dK_dq, dK_dv = value_and_grad(Ops(), network.kind, params, q, v)
+            K = K + 0.5 * network.energy * (v * momentum).sum(-1)
+            dK_dv = dK_dv + network.energy * momentum
             return (grad_h * v).sum(-1) + gamma * h - K, K, grad_h - dK_dv, dK_dq
 
-    shapes = ((2, nq), (2, nv), (2,), (2, nv))  # any batch but 1, which the tracer could take for a constant
+    shapes = ((2, nq), (2, nv), (2, nv), (2,), (2, nv))  # any batch but 1, which the tracer could take for a constant
     example = tuple(torch.zeros(shape, dtype=torch.float64) for shape in shapes)
     with TemporaryDirectory() as folder, warnings.catch_warnings():
         # the tracer is announced to go, but its successor needs one more package and gains nothing here

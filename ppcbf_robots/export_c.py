@@ -71,8 +71,8 @@ static inline double ${p}_f(const double *q, const double *v, double *df)
     return ${p}_dot(${P}_LAST, L.${last}, ${p}_w_out);
 }
 
-/* K(q, v) >= 0, returned, and its gradients dK_dq (NQ) and dK_dv (NV). */
-static inline double ${p}_K(const double *q, const double *v, double *dK_dq, double *dK_dv)
+/* The learned part of K, returned, and its gradients dK_dq (NQ) and dK_dv (NV). */
+static inline double ${p}_learned(const double *q, const double *v, double *dK_dq, double *dK_dv)
 {
     static const double rest[${P}_NV] = {0.0};
     const double zero_at_rest = ${p}_zero_at_rest[0];
@@ -91,8 +91,8 @@ _CONVEX = Template("""\
 static inline double ${p}_sigmoid(double x) { return 0.5 * (1.0 + tanh(0.5 * x)); }
 static inline double ${p}_softplus(double x) { return log1p(exp(-fabs(x))) + (x > 0.0 ? x : 0.0); }
 
-/* K(q, v) >= 0, returned, and its gradients dK_dq (NQ) and dK_dv (NV). */
-static inline double ${p}_K(const double *q, const double *v, double *dK_dq, double *dK_dv)
+/* The learned part of K, returned, and its gradients dK_dq (NQ) and dK_dv (NV). */
+static inline double ${p}_learned(const double *q, const double *v, double *dK_dq, double *dK_dv)
 {
     double ra[${P}_UNITS], c[${P}_UNITS], b[${P}_UNITS * ${P}_NV];
     double dra[${P}_UNITS], dc[${P}_UNITS], db[${P}_UNITS * ${P}_NV]; /* dK/dra, dK/dc, dK/db */
@@ -146,6 +146,14 @@ static inline double ${p}_K(const double *q, const double *v, double *dK_dq, dou
 """)
 
 _PHI = Template("""\
+/* K >= 0, returned, the gradient dK_dq (NQ) of its learned part, and dK_dv (NV); momentum (NV) is M(q) v. */
+static inline double ${p}_K(const double *q, const double *v, const double *momentum, double *dK_dq, double *dK_dv)
+{
+    const double K = ${p}_learned(q, v, dK_dq, dK_dv);
+    for (int i = 0; i < ${P}_NV; ++i) dK_dv[i] += ${P}_ENERGY * momentum[i];
+    return K + 0.5 * ${P}_ENERGY * ${p}_dot(${P}_NV, v, momentum);
+}
+
 /* phi of one row, returned, and dphi_dv (NV), from K and dK_dv of the same state. */
 static inline double ${p}_row(double K, const double *dK_dv, const double *v, double h, const double *grad_h,
                               double *dphi_dv)
@@ -155,14 +163,14 @@ static inline double ${p}_row(double K, const double *dK_dv, const double *v, do
 }
 
 /* phi of one row, returned, with all it is made of.
- *   in:  q (NQ), v (NV), h, grad_h (NV)
+ *   in:  q (NQ), v (NV), momentum (NV), h, grad_h (NV)
  *   out: K (one number), dphi_dv (NV), dK_dq (NQ); none may overlap another argument
  */
-static inline double ${p}_phi(const double *q, const double *v, double h, const double *grad_h,
-                              double *K, double *dphi_dv, double *dK_dq)
+static inline double ${p}_phi(const double *q, const double *v, const double *momentum, double h,
+                              const double *grad_h, double *K, double *dphi_dv, double *dK_dq)
 {
     double dK_dv[${P}_NV];
-    *K = ${p}_K(q, v, dK_dq, dK_dv);
+    *K = ${p}_K(q, v, momentum, dK_dq, dK_dv);
     return ${p}_row(*K, dK_dv, v, h, grad_h, dphi_dv);
 }
 """)
@@ -180,6 +188,7 @@ ${about}
 #define ${P}_NV ${nv}
 #define ${P}_GAMMA ${gamma} /* [1/s] */
 #define ${P}_ALPHA ${alpha} /* [1/s] */
+#define ${P}_ENERGY ${energy} /* what the kinetic energy weighs in K [m/(s J)] */
 #define ${P}_WIDTH ${widest} /* units of the widest hidden layer */
 #define ${P}_LAST ${width} /* units of the last hidden layer */
 
@@ -213,6 +222,7 @@ def c_header(network: NumpyNetwork, meta: dict[str, Any], name: str) -> str:
         nv=meta["nv"],
         gamma=_number(meta["gamma"]),
         alpha=_number(meta["alpha"]),
+        energy=_number(meta["energy"]),
         widest=max([m for _, m in layers], default=1),
         arrays="\n".join(_array(f"{prefix}_{k}", w) for k, w in sorted(network.params.items())),
         code="\n".join(code),
@@ -280,9 +290,10 @@ def _about(meta: dict[str, Any], prefix: str) -> str:
         f"'{meta['world']}'.",
         "C99, no dependencies but <math.h>, no allocation, no state: safe to call from several threads.",
         "",
-        f"Constants: gamma = {meta['gamma']} 1/s, alpha = {meta['alpha']} 1/s.",
+        f"Constants: gamma = {meta['gamma']} 1/s, alpha = {meta['alpha']} 1/s, energy = {meta['energy']:.6g} m/(s J).",
         f"q ({meta['nq']}) [{units['q']}]: {layout}",
         f"v ({meta['nv']}) [{units['v']}]: {', '.join(meta['joints'])}",
+        f"momentum ({meta['nv']}): M(q) v with the mass matrix M.",
         f"h [{units['h']}]: one row of the safety function, h >= 0 is safe.",
         f"grad_h ({meta['nv']}): its gradient with respect to the velocity coordinates, so that dh/dt = grad_h . v.",
         f"phi and K [{units['phi']}].",
@@ -295,9 +306,9 @@ def _about(meta: dict[str, Any], prefix: str) -> str:
         "",
         "Usage, one row:",
         f"  double K, dphi_dv[{P}_NV], dK_dq[{P}_NQ];",
-        f"  double phi = {prefix}_phi(q, v, h, grad_h, &K, dphi_dv, dK_dq);",
+        f"  double phi = {prefix}_phi(q, v, momentum, h, grad_h, &K, dphi_dv, dK_dq);",
         "Usage, many rows of one state (K does not depend on the row):",
-        f"  double K = {prefix}_K(q, v, dK_dq, dK_dv);",
+        f"  double K = {prefix}_K(q, v, momentum, dK_dq, dK_dv);",
         f"  for each row k: phi[k] = {prefix}_row(K, dK_dv, v, h[k], grad_h[k], dphi_dv[k]);",
     ]
     wrapped = [part for line in lines for part in _wrap(_comment(line))]

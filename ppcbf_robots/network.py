@@ -15,6 +15,9 @@ Two forms:
   README's theory section).
   Its layers see q scaled to X and, as the dynamics do, the cosine and sine of every angle (``turns`` is 1 for angles
   and 0 for lengths and for the cos and sin of continuous joints).
+
+To either a share of the kinetic energy may be added (:func:`energy_weight`). That needs the mass matrix, so it is left
+to those who have it: the functions here give K without.
 """
 
 from __future__ import annotations
@@ -156,6 +159,16 @@ def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> C
     return K
 
 
+def energy_weight(xp: Any, params: Params) -> Any:
+    """What the kinetic energy [J] weighs in K [m/(s J)]: 0 where there is no such term.
+
+    The energy is zero at rest and convex in v as well, and its rate needs no derivative of M:
+    ``d/dt ½ vᵀ M v = vᵀ (u - g)``. It is largest where an arm is stretched and all its joints move one way, which is
+    where torque runs short; of the posture alone the layers would have to learn that.
+    """
+    return _softplus(xp, params["energy_a"]) * params["energy_scale"] if "energy_a" in params else 0.0
+
+
 _FORMS = {"mlp": _mlp, "convex": _convex}
 
 
@@ -170,10 +183,11 @@ class NumpyNetwork:
     def __init__(self, kind: NetworkKind, params: Mapping[str, Any]) -> None:
         self.kind: NetworkKind = kind
         self.params = {k: np.asarray(w, dtype=np.float64) for k, w in params.items()}
+        self.energy = float(energy_weight(np, self.params))
         self._packed: tuple[Any, ...] | None = None
 
     def value(self, q: Any, v: Any) -> Any:
-        """K (...) alone, for q (..., nq) and v (..., nv)."""
+        """K (...) alone, without energy, for q (..., nq) and v (..., nv)."""
         return value_along(np, self.kind, self.params, q, v)(np.ones(np.shape(v)[:-1]))
 
     def value_and_grad(self, q: Any, v: Any) -> tuple[Any, Any, Any]:

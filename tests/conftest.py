@@ -147,6 +147,8 @@ def random_network() -> Callable[..., NumpyNetwork]:
             "v_scale": rng.uniform(0.5, 1.5, nv), "turns": np.arange(nq) % 3 < 2,
             "cone_a": rng.normal(), "cone_b": rng.normal(size=nv), "cone_c": rng.normal(),
             "bowl_a": rng.normal(), "bowl_b": rng.normal(size=nv), "bowl_c": rng.normal()}  # fmt: skip
+        if kind == "convex" and nv > 2:  # as the learner has it
+            params |= {"energy_a": rng.normal(), "energy_scale": rng.uniform(0.05, 0.2)}
         return NumpyNetwork(kind, params)
 
     return build

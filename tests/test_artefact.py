@@ -146,7 +146,7 @@ def test_truncated_or_foreign_json(folder):
     assert refusal(folder).startswith(f"{path}: cannot be read (")
     for other in ("[]", "{}", "null", "3"):
         path.write_text(other)
-        assert refusal(folder) == f"{path}: not a barrier of format 3; train it again with this version"
+        assert refusal(folder) == f"{path}: not a barrier of format 4; train it again with this version"
 
 
 def test_missing_files(folder, tmp_path):
@@ -168,9 +168,9 @@ def test_missing_keys(folder, key):
     ("changes", "expected"),
     [
         ({"format": 1}, "a barrier of an earlier version, which this one cannot read; train it again"),
-        ({"format": 4}, "not a barrier of format 3; train it again with this version"),
-        ({"format": "3"}, "not a barrier of format 3; train it again with this version"),
-        ({"format": [1]}, "not a barrier of format 3; train it again with this version"),
+        ({"format": 5}, "not a barrier of format 4; train it again with this version"),
+        ({"format": "4"}, "not a barrier of format 4; train it again with this version"),
+        ({"format": [1]}, "not a barrier of format 4; train it again with this version"),
         ({"kind": "magic"}, "unknown kind 'magic' or network"),
         ({"network": "transformer"}, "unknown kind 'pp-ncbf' or network 'transformer'"),
         ({"kind": ["pp-ncbf"]}, "the key 'kind' does not hold a str; the file was altered"),

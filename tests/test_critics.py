@@ -17,7 +17,7 @@ from ppcbf_robots.barriers import BarrierRows, rho_rows
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import ClosedForm, FilterConfig, Status
 from ppcbf_robots.learning.band import Band
-from ppcbf_robots.learning.critics import closed_form_critics, feasibility_margin
+from ppcbf_robots.learning.critics import closed_form_critics, feasibility
 from ppcbf_robots.learning.linear_program import best_worst_row
 from ppcbf_robots.learning.rays import Field, Rays, rays_at, to_tensors
 from ppcbf_robots.network import NumpyNetwork, random_convex
@@ -197,7 +197,7 @@ def test_no_programs_have_no_solutions():
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """Rows, box and passivity budget of ``feasibility_margin``, and the linear program that they mean."""
+    """Rows, box and passivity budget of ``feasibility``, and the linear program that they mean."""
 
     hdot: Any
     phi: Any
@@ -235,7 +235,9 @@ class Rows:
         given = [torch.as_tensor(a if b is None else b) for a, b in ((self.phi, phi), (self.Lf, Lf), (self.Lg, Lg))]
         others = [torch.as_tensor(x) for x in (self.v, self.u_des, self.d_p, self.u_max)]
         rows = BarrierRows(None, torch.as_tensor(self.hdot), *given, None)
-        return feasibility_margin(rows, *others, self.config, passive)
+        programs = feasibility(rows, *others, self.config, passive)
+        margin: torch.Tensor = programs.margin(programs.solve())
+        return margin
 
     def exact(self, passive: bool) -> np.ndarray:
         """``max t``, ``t <= offset_k + c_k u`` for all k, u in the box and ``vᵀ(u - u_des) <= d_p``; NaN if empty."""
@@ -337,21 +339,26 @@ def test_near_rest_the_band_asks_for_no_passivity(two_link, random_network):
 @tries(max_examples=60)
 @given(nv=st.integers(2, 8), seed=st.integers(0, 2**32 - 1))
 def test_convex_weights_take_energy_out_on_the_boundary(nv, seed):
-    """``v · w_k <= -gamma h_k`` on ``phi_k = 0``, for any weights, number of joints and rows with ``h_k >= 0``."""
+    """``v · w_k <= -gamma h_k`` on ``phi_k = 0``, for any weights, number of joints and rows with ``h_k >= 0``.
+
+    With a share of the kinetic energy or without.
+    """
     rng, count, rows = np.random.default_rng(seed), 40, 6
     params = random_convex(nv, nv, (16, 16), 5, rng)
     params |= {k: x * rng.uniform(0.5, 8.0) for k, x in params.items() if k[0] in "Wb" and k not in ("Wa", "ba")}
     params |= {"ba": rng.normal(0.0, 3.0, 5), "v_scale": rng.uniform(0.2, 3.0, nv)}
     network, gamma = NumpyNetwork("convex", params), float(rng.uniform(0.5, 20.0))
     q, v = rng.uniform(-3.0, 3.0, (count, nv)), rng.normal(0.0, 2.0, (count, nv))
+    A = rng.normal(size=(count, nv, nv))
+    Minv = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(nv)
     K, _, K_v = network.value_and_grad(q, v)
+    energy, Mv = rng.uniform(0.0, 3.0) * (rng.random() < 0.7), np.linalg.solve(Minv, v[..., None])[..., 0]
+    K, K_v = K + 0.5 * energy * (v * Mv).sum(-1), K_v + energy * Mv
     assert np.all(K >= -1e-12)
     h = rng.uniform(0.0, 1.0, (count, rows)) * (rng.random((count, rows)) < 0.8)
     grad = rng.normal(size=(count, rows, nv))
     missing = K[:, None] - gamma * h - (grad @ v[..., None])[..., 0]  # of ḣ, for phi = 0
     grad += missing[..., None] * v[:, None] / (v * v).sum(-1)[:, None, None]
-    A = rng.normal(size=(count, nv, nv))
-    Minv = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(nv)
     hdot = (grad @ v[..., None])[..., 0]
     b, zero = rng.normal(size=(count, nv)), np.zeros(count)
     found = rho_rows(h, hdot, grad, np.zeros_like(h), Minv, b, gamma, K, zero, K_v)

@@ -20,7 +20,8 @@ def state(problem, barrier, q, v):
 def rise(network, dyn, u):
     """Change of K over one period at a fixed q, divided by it."""
     end = dyn.v + DT * dyn.Minv @ (u - dyn.b)
-    return (network.value(dyn.q, end) - network.value(dyn.q, dyn.v)) / DT
+    K, K_end = (network.value(dyn.q, v) + 0.5 * network.energy * v @ dyn.M @ v for v in (dyn.v, end))
+    return (K_end - K) / DT
 
 
 def test_the_tangent_touches_K_at_the_end_of_the_period_and_lies_below_it_elsewhere(problem, states, make_barrier):
@@ -30,7 +31,7 @@ def test_the_tangent_touches_K_at_the_end_of_the_period_and_lies_below_it_elsewh
         dyn, safety, rows = state(problem, barrier, q, v)
         u, other = rng.uniform(-1.0, 1.0, (2, problem.model.nv)) * u_max
         short, cut = shortfall_and_cut(barrier.network, dyn, safety, rows, u, DT)
-        slope = barrier.network.value_and_grad(q, v)[2]
+        slope = barrier.network.value_and_grad(q, v)[2] + barrier.network.energy * dyn.M @ v
 
         def true_psi(torque, dyn=dyn, rows=rows, slope=slope):
             linear = slope @ dyn.Minv @ (torque - dyn.b)

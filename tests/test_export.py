@@ -55,6 +55,7 @@ def random_network(kind: str, nq: int, nv: int, rng: np.random.Generator, widths
         params |= {"v_scale": rng.uniform(0.3, 1.5, nv), "turns": rng.integers(0, 2, nq)}
         for form in ("cone", "bowl"):
             params |= {f"{form}_a": rng.normal(), f"{form}_b": rng.normal(size=nv), f"{form}_c": rng.normal()}
+        params |= {"energy_a": rng.normal(), "energy_scale": rng.uniform(0.1, 1.0)} if nv > 2 else {}
     return NumpyNetwork(kind, params)
 
 
@@ -76,13 +77,16 @@ def stored_barrier(robot: str, kind: str, seed: int = 0, **changes: Any) -> Stor
 
 def random_inputs(robot: str, batch: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     nq, nv = sizes(robot)
-    return {"q": rng.normal(size=(batch, nq)), "v": 2.0 * rng.normal(size=(batch, nv)), "h": rng.normal(size=batch),
+    return {"q": rng.normal(size=(batch, nq)), "v": 2.0 * rng.normal(size=(batch, nv)),
+            "momentum": rng.normal(size=(batch, nv)), "h": rng.normal(size=batch),
             "grad_h": rng.normal(size=(batch, nv))}  # fmt: skip
 
 
-def expected(network: NumpyNetwork, gamma: float, q, v, h, grad_h) -> dict[str, np.ndarray]:
+def expected(network: NumpyNetwork, gamma: float, q, v, momentum, h, grad_h) -> dict[str, np.ndarray]:
     """The numpy evaluation of everything an export gives."""
     K, dK_dq, dK_dv = network.value_and_grad(q, v)
+    energy = np.logaddexp(0.0, network.params["energy_a"]) * network.params["energy_scale"] if network.energy else 0.0
+    K, dK_dv = K + 0.5 * energy * (v * momentum).sum(-1), dK_dv + energy * momentum
     return {"phi": (grad_h * v).sum(-1) + gamma * h - K, "K": K, "dphi_dv": grad_h - dK_dv, "dK_dq": dK_dq}
 
 
@@ -183,9 +187,10 @@ def test_onnx_equals_numpy_for_any_batch(robot: str, kind: str, tmp_path: Path) 
 
 SHARED = """\
 #include "my-arm.h"
-double phi(const double *q, const double *v, double h, const double *grad_h, double *K, double *w, double *dK_dq)
+double phi(const double *q, const double *v, const double *momentum, double h, const double *grad_h, double *K,
+           double *w, double *dK_dq)
 {
-    return my_arm_phi(q, v, h, grad_h, K, w, dK_dq);
+    return my_arm_phi(q, v, momentum, h, grad_h, K, w, dK_dq);
 }
 """
 
@@ -201,13 +206,13 @@ def compiled(stored: StoredBarrier, folder: Path) -> Any:
     subprocess.run([gcc, *flags, "shared.c", "-o", "shared.so", "-lm"], cwd=folder, check=True)
     library = ctypes.CDLL(str(folder / "shared.so"))
     array, number = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS"), ctypes.c_double
-    library.phi.restype, library.phi.argtypes = number, [array, array, number, array, array, array, array]
+    library.phi.restype, library.phi.argtypes = number, [array, array, array, number, array, array, array, array]
     return library
 
 
-def run_c(library: Any, q, v, h, grad_h) -> dict[str, Any]:
+def run_c(library: Any, q, v, momentum, h, grad_h) -> dict[str, Any]:
     K, w, dK_dq = np.full(1, np.nan), np.full(v.shape, np.nan), np.full(q.shape, np.nan)
-    phi = library.phi(q, v, h, grad_h, K, w, dK_dq)
+    phi = library.phi(q, v, momentum, h, grad_h, K, w, dK_dq)
     return {"phi": np.float64(phi), "K": K[0], "dphi_dv": w, "dK_dq": dK_dq}
 
 
@@ -218,7 +223,7 @@ def test_c_equals_numpy(robot: str, kind: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     for scale in (0.0, 1e-3, 1.0, 1.0, 1.0, 1e3):  # at rest; small; usual; where exp would overflow
         one = {k: x[0] for k, x in random_inputs(robot, 1, rng).items()}
-        one["v"] = one["v"] * scale
+        one["v"], one["momentum"] = one["v"] * scale, one["momentum"] * scale
         wanted = expected(stored.network, stored.spec.gamma, **one)
         for name, got in run_c(library, **one).items():
             assert_close(got, wanted[name], 1e-9)

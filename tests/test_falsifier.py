@@ -189,3 +189,27 @@ def test_off_the_band_there_is_nothing(weak):
     least, _, v = falsifier.margins(params, away)
     assert np.isinf(least[0]) and not v.any()
     assert falsifier.margins(params, np.zeros((0, 5)))[0].shape == (0,)
+
+
+def test_states_below_a_reserve_come_back_without_counting_as_violations(two_link):
+    """``enough`` counts states that violate; the others only have less than was asked for."""
+    found = attack(two_link, rounds=4, below=0.5, enough=1)
+    assert found.worst > 0.0 and len(found.q) > 100
+    margin = make(two_link).margins
+    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(two_link).items()}
+    domain = two_link.robot.domain
+    level = np.zeros((len(found.q), 1))
+    again = margin(params, np.concatenate([two_link.model.to_angles(found.q), found.v, level], axis=1))[0]
+    assert np.all(np.abs(found.v) <= np.abs(domain.v).max(axis=1) + 1e-9) and np.mean(again < 1.0) > 0.5
+
+
+def test_cornered_states_run_into_bounds_of_X(panda):
+    """A quarter of the joints are within 1.5 |v| / gamma of the bound they move to; all stay in X."""
+    domain, gamma = panda.robot.domain, 4.0
+    q, v = domain.sample_cornered(np.random.default_rng(0), 20_000, gamma)
+    for x, box in ((q, domain.q), (v, domain.v)):
+        assert np.all((x >= box[:, 0]) & (x <= box[:, 1]))
+    distance = np.where(v >= 0.0, domain.q[:, 1] - q, q - domain.q[:, 0])
+    by_chance = np.minimum(1.0, 1.5 * np.abs(v) / gamma / np.ptp(domain.q, axis=1))
+    close = np.mean(distance <= 1.5 * np.abs(v) / gamma + 1e-12, axis=0)
+    np.testing.assert_allclose(close, 0.25 + 0.75 * by_chance.mean(axis=0), atol=0.02)

@@ -25,6 +25,7 @@ from ppcbf_robots.learning.margin_descent import (
     HUMBLER,
     LEAST_WEIGHT,
     NEAR,
+    RESERVE,
     STRICTER,
     WEIGHT_FALL,
     WEIGHT_GROWTH,
@@ -355,12 +356,8 @@ def test_half_of_a_batch_is_drawn_where_margins_are_small(cartpole, monkeypatch)
 
 def weights_over(descent: MarginDescent, margin: float, count: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The weight of the volume over iterations in which all states have a margin."""
-    real = descent.band.margin
-
-    def told(*arguments: Any, **options: Any) -> Any:
-        return 0.0 * real(*arguments, **options) + margin
-
-    monkeypatch.setattr(descent.band, "margin", told)
+    real = Feasibility.margin
+    monkeypatch.setattr(Feasibility, "margin", lambda self, optimum: 0.0 * real(self, optimum) + margin)
     found = []
     for _ in range(count):
         descent.iterate()
@@ -369,7 +366,7 @@ def weights_over(descent: MarginDescent, margin: float, count: int, monkeypatch:
 
 
 def test_the_volumes_weight_falls_with_violations_and_grows_without(two_link, monkeypatch):
-    descent, largest = margin_descent(two_link), TINY.volume_weight / 2
+    descent, largest = margin_descent(two_link), TINY.volume_weight / 4
     falling = weights_over(descent, -0.1, 80, monkeypatch)
     assert falling[0] == pytest.approx(WEIGHT_FALL * largest)
     assert np.all(np.diff(falling) <= 0.0)
@@ -406,7 +403,7 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     tried: list[int] = []  # candidates attacked until the refinement
     real = Attack(-0.25, q, v, 1234)
     calls: list[int] = []
-    monkeypatch.setattr(MarginDescent, "attack", lambda self, params: (calls.append(1), real)[1])
+    monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: (calls.append(1), real)[1])
     _, result = train(two_link, on_refine=lambda note: (notes.append(note), tried.append(len(calls))))
     assert not result.converged
     assert result.reason == "the falsifier found states of too little margin, the least -0.2500"
@@ -416,6 +413,48 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     report = result.report()
     assert (report["worst_margin"], report["attacked"], report["samples"]) == (-0.25, 1234, 0)
     assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_states_known_to_violate_make_a_search_needless(panda, monkeypatch):
+    """They are looked at first; only if the parameters stand them the falsifier searches."""
+    descent = margin_descent(panda)
+    params, (q, v) = descent.snapshot(), draw(panda, 40, seed=3)
+    known = Attack(-0.1, q, v, 99)
+    searched: list[float] = []
+    monkeypatch.setattr(descent.falsifier, "search", lambda *a, below, **k: (searched.append(below), known)[1])
+    margins = torch.linspace(-0.2, 0.19, 40)
+    monkeypatch.setattr(descent, "rays_through", lambda q, v: None)
+    monkeypatch.setattr(descent.band, "least_margin", lambda params, rays: (margins, margins))
+    found = descent.attack(params, known)
+    assert not searched and found.worst == pytest.approx(-0.2) and found.evaluated == 40
+    np.testing.assert_array_equal(found.q, q[:20])
+    np.testing.assert_array_equal(found.v, v[:20])
+    margins = margins.abs()
+    assert descent.attack(params, known) is known and descent.attack(params, None) is known
+    assert searched == [RESERVE, RESERVE]
+
+
+def test_rays_are_drawn_in_proportion_to_what_they_lack(cartpole):
+    descent = margin_descent(cartpole)
+    descent._near = torch.tensor([5, 6, 7])
+    full = NEAR + descent.margin
+    descent._noted[descent._near] = torch.tensor([full, full - 0.01, full - 0.04])
+    share = np.bincount(descent._urgent(20_000).numpy(), minlength=3) / 20_000
+    np.testing.assert_allclose(share, np.array([1e-3, 1e-2, 4e-2]) / 0.051, atol=0.01)
+
+
+def test_the_rate_warms_up_for_a_refinement(two_link):
+    descent = margin_descent(two_link)
+    p = dataclasses.replace(DEFAULT, iterations=100, refinement_share=0.5, refinement_rate=0.4)
+    descent.preset, descent.planned = p, 100
+
+    def rate(iteration: int, planned: int) -> float:
+        descent.iteration, descent.planned = iteration, planned
+        descent.set_rate()
+        return descent.optimizer.param_groups[0]["lr"] / p.learning_rate
+
+    assert [rate(i, 100) for i in (0, 50, 99)] == pytest.approx([1.0, 0.5, 0.1])
+    assert [rate(i, 150) for i in (100, 125, 149)] == pytest.approx([0.4, 0.2, 0.1])
 
 
 def test_the_report_of_a_clean_run_names_the_attack(two_link):

@@ -45,7 +45,7 @@ class Descent(ABC):
         self.rng = np.random.default_rng(seed)
         self.filter_config = FilterConfig(kind=preset.filter, metric=preset.metric)
         self.rays, self.volume = self._pool()
-        params = initial_parameters(problem, preset, self.generator)
+        params = initial_parameters(problem, preset, float(self.volume.energy.mean()), self.generator)
         self.params: Tensors = {k: x.to(self.device, self.dtype) for k, x in params.items()}
         self.judged: Tensors = self.params  # what checks and evidence look at
         self.trained = [k for k in self.params if k not in CONSTANTS]
@@ -108,9 +108,12 @@ class Descent(ABC):
         return Rays(**to_tensors([{k: x[free] for k, x in arrays.items()}], self.device, self.dtype))
 
     def set_rate(self) -> None:
-        """The learning rate falls linearly over the planned iterations."""
+        """The learning rate falls linearly over the planned iterations, and from a lower one over a refinement's."""
+        p, left = self.preset, self.planned - self.iteration
+        first = self.planned == p.iterations
+        share = left / p.iterations if first else p.refinement_rate * left / (p.refinement_share * p.iterations)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.preset.learning_rate * max(LAST_RATE, 1.0 - self.iteration / self.preset.iterations)
+            group["lr"] = p.learning_rate * max(LAST_RATE, share)
 
     def sample(
         self, count: int, pool: torch.Tensor | None = None, params: Tensors | None = None
@@ -129,7 +132,7 @@ class Descent(ABC):
     @torch.no_grad()
     def volume_kept(self) -> float:
         """Volume of the safe set over that of the LB set, on uniform states of X."""
-        K = self.band.field.K(self.judged, self.volume.q, self.volume.v)[0]
+        K = self.band.field.K_of(self.judged, self.volume)
         lb = self.volume.rho >= 0.0
         return float((self.volume.rho - K >= 0.0).sum() / lb.sum().clamp(min=1))
 

@@ -108,7 +108,7 @@ class MarginDescent(Descent):
         The first is given up to a constant: its gradient is that of ``K / |∂phi/∂log s|``. The second has no dimension.
         """
         v = s[:, None] * rays.d
-        K, K_q_rate, K_v = self.band.field.K(self.params, rays.q, v)
+        K, K_q_rate, K_v = self.band.field.K(self.params, rays, s)
         hdot = (rays.grad @ v[..., None])[..., 0]
         row = (hdot + self.band.field.gamma * rays.h).argmin(-1, keepdim=True)
         slope = ((v * K_v).sum(-1) - hdot.gather(-1, row)[:, 0]).detach().clamp(min=1e-3)

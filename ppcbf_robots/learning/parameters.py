@@ -10,11 +10,14 @@ from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.problem import Problem
 
 Tensors = dict[str, torch.Tensor]
-CONSTANTS = ("in_shift", "in_scale", "turns", "v_scale", "zero_at_rest")  # parameters that are not trained
+CONSTANTS = ("in_shift", "in_scale", "turns", "v_scale", "energy_scale", "zero_at_rest")  # not trained
 
 
-def initial_parameters(problem: Problem, preset: Preset, generator: torch.Generator) -> Tensors:
-    """Parameters for the preset's network; K starts near zero, that is, near the LB barrier."""
+def initial_parameters(problem: Problem, preset: Preset, energy: float, generator: torch.Generator) -> Tensors:
+    """Parameters for the preset's network; K starts near zero, that is, near the LB barrier.
+
+    ``energy`` [J] is the mean kinetic energy over X; robots with few joints get no term of it.
+    """
     shift, scale = _q_scaling(problem)
     v_max = torch.tensor(abs(problem.robot.domain.v).max(axis=1), dtype=torch.float64)
     if preset.network == "mlp":
@@ -40,6 +43,9 @@ def initial_parameters(problem: Problem, preset: Preset, generator: torch.Genera
         c = c if form == "bowl" else math.log(math.expm1(c))
         p[f"{form}_a"], p[f"{form}_c"] = (torch.tensor(x, dtype=torch.float64) for x in (math.log(math.expm1(a)), c))
         p[f"{form}_b"] = torch.full((nv,), b, dtype=torch.float64)
+    if nv > preset.covered_joints:
+        p["energy_a"] = torch.tensor(math.log(math.expm1(preset.energy)), dtype=torch.float64)
+        p["energy_scale"] = torch.tensor(1.0 / energy, dtype=torch.float64)
     p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -3.0, dtype=torch.float64)
     p["Wc"], p["bc"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -1.0, dtype=torch.float64)
     p["Wb"], _ = _linear(width, units * nv, generator)

@@ -23,6 +23,7 @@ class Preset:
     gamma: float | None = None  # [1/s], where the robot spec gives none and X is small enough to be covered
     covered_joints: int = 2  # up to which it is: beyond, the spec's default gamma leaves K less to learn
     units: int = 0  # convex network: number of terms
+    energy: float = 0.0  # convex network, beyond the covered joints: first K [m/s] at the mean kinetic energy of X
     samples: int = 1000  # N, new band states per iteration
     epochs: int = 1  # closed form: E, gradient steps per iteration
     top: int = 100  # closed form: k of Top_k
@@ -45,6 +46,7 @@ class Preset:
     search_rounds: int = 0  # QP: of the falsifier at every check, per joint
     refinements: int = 4  # further rounds when the evidence finds violations
     refinement_share: float = 0.5  # of the planned iterations, added by each
+    refinement_rate: float = 0.0  # of the learning rate, with which each begins; at least the last one
     min_volume: float = 0.2  # of the LB set; less counts as collapsed
     test_samples: int = 5_000  # uniform band states of the evidence
     attack_rounds: int = 0  # QP: of the falsifier in the evidence, per joint
@@ -75,6 +77,7 @@ DEFAULT = Preset(
     network="convex",
     hidden=(64, 64),
     units=12,
+    energy=0.5,
     filter="qp",
     metric="kinetic",
     learning_rate=3e-3,
@@ -92,6 +95,7 @@ DEFAULT = Preset(
     search_rounds=8,
     refinements=8,
     refinement_share=0.3,
+    refinement_rate=0.4,
     test_samples=10_000,
     attack_rounds=200,
 )

@@ -7,6 +7,7 @@ another call of Pinocchio, and bisection in s lands on any level of phi.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from ppcbf_robots.barriers import BarrierRows, rho_rows
-from ppcbf_robots.network import NetworkKind, Params, value_along, value_and_grad
+from ppcbf_robots.network import NetworkKind, Params, energy_weight, value_along, value_and_grad
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array
@@ -38,6 +39,7 @@ class Rays:
     g: torch.Tensor  # (B, nv)
     beta: torch.Tensor  # (B, nv)
     u_rest: torch.Tensor  # (B, nv)
+    Md: torch.Tensor  # (B, nv)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -66,6 +68,7 @@ class VolumeStates:
     q: torch.Tensor
     v: torch.Tensor
     rho: torch.Tensor
+    energy: torch.Tensor  # (B,) [J], kinetic
 
 
 class Field:
@@ -78,16 +81,31 @@ class Field:
         self._partner = torch.as_tensor(model.rate_partner, device=device)
         self._v_index = torch.as_tensor(model.rate_v, device=device)
 
-    def K(self, params: Params, q: torch.Tensor, v: torch.Tensor) -> tuple[Any, Any, Any]:
-        """K (B,), ∂K/∂q · q̇ (B,), ∂K/∂v (B, nv)."""
-        K, K_q, K_v = value_and_grad(torch, self.kind, params, q, v)
-        rate = (self._const + self._sign * q[..., self._partner]) * v[..., self._v_index]
-        return K, (K_q * rate).sum(-1), K_v
+    def K(self, params: Params, rays: Rays, s: torch.Tensor) -> tuple[Any, Any, Any]:
+        """K (B,), ∂K/∂q · q̇ (B,), ∂K/∂v (B, nv) at v = s d."""
+        v, energy = s[:, None] * rays.d, energy_weight(torch, params)
+        K, K_q, K_v = value_and_grad(torch, self.kind, params, rays.q, v)
+        rate = (self._const + self._sign * rays.q[..., self._partner]) * v[..., self._v_index]
+        K_q_rate, Mv = (K_q * rate).sum(-1), s[:, None] * rays.Md
+        work = s * s * (v * rays.beta).sum(-1)  # ½ vᵀ Ṁ v = vᵀ C v
+        return K + 0.5 * energy * (v * Mv).sum(-1), K_q_rate + energy * work, K_v + energy * Mv
+
+    def K_along(self, params: Params, rays: Rays) -> Callable[[torch.Tensor], torch.Tensor]:
+        """The function ``s -> K(q, s d)`` of all rays."""
+        K = value_along(torch, self.kind, params, rays.q, rays.d)
+        full = 0.5 * energy_weight(torch, params) * (rays.d * rays.Md).sum(-1)
+        return lambda s: K(s) + s * s * full
+
+    def K_of(self, params: Params, states: VolumeStates) -> torch.Tensor:
+        """K (B,)."""
+        K: torch.Tensor = value_along(torch, self.kind, params, states.q, states.v)(torch.ones_like(states.rho))
+        K = K + energy_weight(torch, params) * states.energy
+        return K
 
     def rows(self, params: Params, rays: Rays, s: torch.Tensor) -> BarrierRows:
         """All near rows at v = s d."""
         v = s[:, None] * rays.d
-        K, K_q_rate, K_v = self.K(params, rays.q, v)
+        K, K_q_rate, K_v = self.K(params, rays, s)
         s2 = (s * s)[:, None]
         hdot = (rays.grad @ v[..., None])[..., 0]
         return rho_rows(
@@ -98,7 +116,7 @@ class Field:
     def crosses(self, params: Params, rays: Rays, level: torch.Tensor) -> torch.Tensor:
         """Which rays start above a level (B,) of ``min_k phi_k`` and end below it."""
         hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
-        K = value_along(torch, self.kind, params, rays.q, rays.d)(torch.ones_like(level))
+        K = self.K_along(params, rays)(torch.ones_like(level))
         ends: torch.Tensor = (hdot + self.gamma * rays.h).amin(-1) - K
         starts: torch.Tensor = self.gamma * rays.h.amin(-1)
         return (starts >= level) & (ends < level)
@@ -113,7 +131,7 @@ class Field:
         ``level / gamma``, and end above it, as where an arm leaves an obstacle.
         """
         hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
-        K = value_along(torch, self.kind, params, rays.q, rays.d)
+        K = self.K_along(params, rays)
 
         def excess(s: torch.Tensor) -> torch.Tensor:
             rho: torch.Tensor = (s[:, None] * hdot + self.gamma * rays.h).amin(-1)
@@ -163,7 +181,9 @@ def build_pool(
         q = problem.model.from_angles(angles)
         ray, rho, free = rays_at(problem, q, v, rows, goals)
         rays.append({k: x[free] for k, x in ray.items()})
-        volume.append({"q": q[free], "v": v[free], "rho": rho[free]})
+        speed = (v * v).sum(-1) / (ray["d"] * ray["d"]).sum(-1)  # squared, relative to that of d
+        energy = 0.5 * speed * (ray["d"] * ray["Md"]).sum(-1)
+        volume.append({"q": q[free], "v": v[free], "rho": rho[free], "energy": energy[free]})
         kept, tried = kept + int(free.sum()), tried + CHUNK
     return rays, volume
 
@@ -180,7 +200,7 @@ def rays_at(
     nearest = np.argsort(gamma * safety.h + np.minimum(hdot, 0.0), axis=-1)[:, :rows]
     pick = np.take_along_axis
     rays = {
-        "q": q, "d": d, "Minv": dyn.Minv, "g": dyn.g, "beta": dyn.Cv,
+        "q": q, "d": d, "Minv": dyn.Minv, "g": dyn.g, "beta": dyn.Cv, "Md": (dyn.M @ d[..., None])[..., 0],
         "h": pick(safety.h, nearest, -1), "eta": pick(safety.curvature, nearest, -1),
         "grad": pick(safety.grad, nearest[..., None], -2),
         "u_rest": problem.robot.controller.u_rest(q, dyn.g, goal_angles),

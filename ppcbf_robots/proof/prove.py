@@ -63,7 +63,7 @@ def obstacle_to_proof(problem: Problem, stored: StoredBarrier) -> str:
     """Why no proof can be tried, as a clause; "" if one can."""
     if problem.model.nv > JOINTS:
         return f"the robot has {problem.model.nv} joints, and proofs reach up to {JOINTS}"
-    if stored.network.kind != "convex":
+    if stored.network.kind != "convex" or stored.network.energy:
         return "the proof bounds the convex network alone (`--preset default`)"
     if stored.filter["kind"] != "qp":
         return "the proof is about the QP filter, and the barrier was trained for the closed form"
