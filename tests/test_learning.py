@@ -19,6 +19,7 @@ from ppcbf_robots.evidence import BandCheck, check_band, uniform_band
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning import margin_descent as margin_descent_module
 from ppcbf_robots.learning.checkpoint import load_checkpoint, save_checkpoint
+from ppcbf_robots.learning.critics import Feasibility
 from ppcbf_robots.learning.falsifier import Attack
 from ppcbf_robots.learning.margin_descent import (
     EXPLORED,
@@ -311,12 +312,12 @@ def test_only_rays_of_small_margin_are_explored_and_join(cartpole):
     first, wanted = len(descent.rays), NEAR + descent.margin
     share = descent._explore()
     added = descent.rays.select(slice(first, None))
-    assert 0 < len(added) < EXPLORED
+    assert 0 < len(added) < 2 * EXPLORED
     least = descent.band.least_margin(descent.params, added)[0]
     assert torch.equal(least, descent._noted[first:])
     assert least.max() < wanted
     assert 0.0 <= share <= (least < 0.0).sum() / 10
-    assert share == pytest.approx(float((least < 0.0).sum()) / EXPLORED, rel=0.2)
+    assert share == pytest.approx(float((least < 0.0).sum()) / (2 * EXPLORED), rel=0.3)
 
 
 def test_where_all_margins_are_large_nothing_joins(two_link):
@@ -349,7 +350,8 @@ def test_half_of_a_batch_is_drawn_where_margins_are_small(cartpole, monkeypatch)
     sample = descent.sample
     monkeypatch.setattr(descent, "sample", lambda count, pool=None: (pools.append(pool), sample(count, pool))[1])
     descent.iterate()
-    assert [len(p) for p in pools] == [len(descent._crossing), len(descent._near)]
+    assert [len(p) for p in pools] == [len(descent._crossing), TINY.samples]
+    assert set(pools[1].tolist()) <= set(descent._near.tolist())
     assert torch.all(descent._noted[descent._near] < NEAR + descent.margin) or descent.iteration == 1
     assert set(descent._near.tolist()) <= set(descent._crossing.tolist())
 
@@ -379,8 +381,9 @@ def test_the_volumes_weight_falls_with_violations_and_grows_without(two_link, mo
     assert float(descent._weight) == pytest.approx(HUMBLER * largest)
 
 
-def test_a_set_without_a_band_is_told_and_does_not_crash(cartpole):
+def test_a_set_without_a_band_is_told_and_does_not_crash(cartpole, monkeypatch):
     descent = margin_descent(cartpole)
+    monkeypatch.setattr(descent, "_explore", lambda: 0.0)
     descent.band.field.gamma = 1e6  # h alone decides: no ray of the pool ends outside
     descent._look()
     assert not len(descent._crossing)
