@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.progress import track
 
 from ppcbf_robots.cli.extras import needs
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
 from ppcbf_robots.cli.study_safe_set import LB, PP, NodesOption, ViableOption, trained, viable_set, write_csv
-from ppcbf_robots.errors import InputError
+from ppcbf_robots.cli.tasks import DaskOption, JobsOption, OutOption, run_tasks
+from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
+from ppcbf_robots.resources import portable
 from ppcbf_robots.safe_sets import Mask, levels_at
 from ppcbf_robots.specs import Array, vector
+from ppcbf_robots.sweep import Task
 
 Point = dict[str, Any]
 
@@ -25,7 +26,7 @@ Point = dict[str, Any]
 def nmpc(
     robot: RobotArgument,
     obstacles: WorldArgument,
-    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for figure and tables.")],
+    out_dir: OutOption,
     barrier: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Trained barrier; may be repeated.")] = None,
     velocity: Annotated[str, typer.Option(metavar="V,...", help="Initial velocity.")] = "0.5,0.5",
     grid: Annotated[int, typer.Option(min=2, max=501, help="Initial states per axis, over X in q.")] = 41,
@@ -34,14 +35,15 @@ def nmpc(
     iterations: Annotated[int, typer.Option(min=1, help="Iterations of IPOPT that a state is given.")] = 50,
     viable: ViableOption = True,
     nodes: NodesOption = 41,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    jobs: JobsOption = 1,
+    dask: DaskOption = None,
     json: JsonOption = False,
 ) -> None:
     """Solve a predictive controller's problem from a grid of configurations and compare with the safe sets (Fig. 6).
 
     A state counts as safe for the NMPC if IPOPT finds a trajectory of N steps within torque limits, joint limits and
     clear of the obstacles, which may be spheres and half-spaces. The paper leaves the cost open; here it is the
-    distance to the robot's goal, its speed and a little of its torque.
+    distance to the robot's goal, its speed and a little of its torque. The same command goes on after an interrupt.
 
     Example: ppcbf study nmpc cartpole wall --out runs/nmpc --jobs 2
     """
@@ -54,9 +56,13 @@ def nmpc(
 
     q = slice_states(problem, x, y)
     barriers = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")} | trained(problem, barrier or [])
-    tasks = planning_tasks(robot, obstacles, (steps, dt, iterations), problem.model.to_angles(q), v)
+    tasks = planning_tasks(problem, (robot, obstacles), (steps, dt, iterations), problem.model.to_angles(q), v)
     reference = viable_set(problem, nodes) if viable and problem.model.nv == 2 else None
-    points = _run(tasks, jobs)
+    records = run_tasks(tasks, out_dir, jobs, dask, "plans")
+    failed = [record["error"] for record in records if "error" in record]
+    if failed:
+        raise CheckFailed(f"{len(failed)} of {len(records)} plans ended with an error; the first: {failed[0]}")
+    points = [record["result"] for record in records]
     found = np.array([p["safe"] for p in points])
     levels = levels_at(problem, barriers, reference, q, np.tile(v, (len(q), 1)))
     sets = {name: level >= 0.0 for name, level in levels.items()}
@@ -74,25 +80,25 @@ def nmpc(
 
 
 def planning_tasks(
-    robot: str, obstacles: str, settings: tuple[int, float, int], angles: Array, v: Array
-) -> list[Callable[[], Point]]:
-    """One task per configuration (n, nv) at velocity v (nv,), each to be sent to a worker process.
+    problem: Problem, names: tuple[str, str], settings: tuple[int, float, int], angles: Array, v: Array
+) -> list[Task]:
+    """One task per configuration (n, nv) at velocity v (nv,).
 
-    ``settings`` are N, dt and the iterations. Raises InputError for a world that the planner does not know.
+    ``names`` are the robot's and the world's, ``settings`` are N, dt and the iterations. Raises InputError for a world
+    that the planner does not know.
     """
     with needs("study", "the predictive controller"):
         from ppcbf_robots.nmpc import Settings, judge, planner
     chosen = Settings(*settings)
-    planner(robot, obstacles, chosen)  # bad input ends here, not in a worker
-    return [partial(judge, robot, obstacles, chosen, tuple(a), tuple(v.tolist())) for a in angles.tolist()]
-
-
-def _run(tasks: list[Callable[[], Point]], jobs: int) -> list[Point]:
-    """The tasks' answers in their order, with a progress bar."""
-    from joblib import Parallel, delayed
-
-    answers = Parallel(n_jobs=jobs, return_as="generator")(delayed(task)() for task in tasks)
-    return list(track(answers, "planning", len(tasks), console=err, transient=True))
+    planner(*names, chosen)  # bad input ends here, not in a worker
+    shared = {"fingerprint": problem.fingerprint(), "goal": problem.robot.goal.tolist(), "settings": settings}
+    robot, obstacles = map(portable, names)
+    return [
+        Task(
+            {"plan": shared, "angles": a, "v": v.tolist()}, partial(judge, robot, obstacles, chosen, tuple(a), tuple(v))
+        )
+        for a in angles.tolist()
+    ]
 
 
 def overlaps(found: Mask, sets: dict[str, Mask]) -> list[dict[str, Any]]:

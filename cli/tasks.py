@@ -25,7 +25,7 @@ MAX_SEEDS = 10_000
 OutOption = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Folder for results; with some, goes on from there.")
 ]
-JobsOption = Annotated[int, typer.Option(min=1, help="Trainings at once on this machine, one core each.")]
+JobsOption = Annotated[int, typer.Option(min=1, help="Tasks at once on this machine, one core each.")]
 DaskOption = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler instead.")
 ]

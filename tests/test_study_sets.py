@@ -109,3 +109,13 @@ def test_overlaps_of_known_masks():
     (row,) = overlaps(found, {"a": np.array([True, False, True, True])})
     assert row == {"set": "a", "share": 0.75, "nmpc_of_set": pytest.approx(2 / 3),
                    "set_not_nmpc": pytest.approx(2 / 3), "nmpc_not_set": 0.5}  # fmt: skip
+
+
+def test_nmpc_goes_on_from_the_plans_that_are_there(tmp_path):
+    """The second run finds all results in the file: nothing is planned again, and the tables are the same."""
+    arguments = ("nmpc", GANTRY, "wall", "--out", str(tmp_path), "--grid", "2", "--steps", "5", "--no-viable")
+    first = run(*arguments)
+    written = (tmp_path / "results.jsonl").read_text()
+    assert len(written.splitlines()) == 4
+    (tmp_path / "results.jsonl").write_text(written.replace('"safe": true', '"safe": false'))
+    assert run(*arguments)["safe"] == 0 < first["safe"]

@@ -89,6 +89,11 @@ class Tested:
     volume_kept: float
 
     @property
+    def violates(self) -> bool:
+        """Whether a state was found that has no feasible torque."""
+        return self.check.violations > 0 or (self.attack is not None and self.attack.worst < 0.0)
+
+    @property
     def failures(self) -> int:
         """Violating states found in either way, and those that come too close to it."""
         return self.check.violations + (0 if self.attack is None else len(self.attack.q))
@@ -224,14 +229,15 @@ class Trainer:
         return check_band(self.problem, barrier, self.filter_config, count, self.descent.rng, passive)
 
     def _refine(self, tested: list[Tested]) -> None:
-        """Violating states join, the descent asks for more, and training goes on for a while."""
+        """The states found join, and training goes on for a while; where some violate, the descent asks for more."""
         self.clean = []
         states = [(t.check.bad_q, t.check.bad_v) for t in tested if t.check.violations]
         states += [(t.attack.q, t.attack.v) for t in tested if t.attack is not None]
         if states:
             q, v = (np.concatenate(x) for x in zip(*states, strict=True))
             self.descent.add_counterexamples(q, v)
-        self.descent.demand_more()
+        if not tested or any(t.violates for t in tested):
+            self.descent.demand_more()
         self.descent.planned = self.descent.iteration + int(self.preset.refinement_share * self.preset.iterations)
 
     def _result(self, best: Tested, interrupted: bool) -> Result:
