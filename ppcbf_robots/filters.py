@@ -106,6 +106,7 @@ class Correction:
     status: Status
     reason: str
     row: int  # index of the row that decided, -1 if none
+    short: float = 0.0  # [m/s²] by which phi changes less over the period than psi(u) says, K being convex in v
 
 
 @dataclass(frozen=True)
@@ -323,16 +324,16 @@ class QPFilter:
         alpha, release, _, margin = self._class_k(allowed is not None)
         bound = alpha * (rows.phi - margin) + release * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
         every = rows
-        for _ in range(CUTS):
+        for i in range(CUTS + 1):
             short, cut = shortfall_and_cut(self._convex, dyn, safety, rows, answer.u, self.config.dt)
-            if np.min(rows.psi(answer.u) + bound) - short >= -SHORT * alpha * margin:
+            answer = replace(answer, short=short)
+            if i == CUTS or np.min(rows.psi(answer.u) + bound) - short >= -SHORT * alpha * margin:
                 break
             every = together(every, cut)
             again = self._once(dyn, every, u_des, d_p, u_max, allowed)
             if again.status is not Status.CORRECTING:
                 break
-            added = len(every.phi) - len(rows.phi)
-            k = again.row
+            k, added = again.row, len(every.phi) - len(rows.phi)
             answer = replace(again, row=k if k < 0 else k % len(rows.phi) if k < len(every.phi) else k - added)
         return answer
 

@@ -37,6 +37,7 @@ class StepResult:
     phi: float  # least over the rows
     row: str  # name of the row that decided, "" if none
     port_power: float = 0.0  # [W] beyond d_p that a moving obstacle puts in through the arm's evasion
+    short: float = 0.0  # [m/s²] by which phi changes less over the period than psi(u) says, K being convex in v
 
 
 @dataclass(frozen=True)
@@ -243,7 +244,7 @@ class SafetyFilter:
         wary = self._slip.wary(t, rows)
         result = self._answer(dyn, safety, rows, wary, u_des, d_p, obstacles is not None, allowed)
         if result.status is not Status.FAULT:
-            self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g)
+            self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g, result.short)
         return result
 
     def _usable(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> bool:
@@ -279,7 +280,7 @@ class SafetyFilter:
             status = Status.RESTING
         u = c.u - offset
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
-        return StepResult(u, status, c.reason, h, phi, self._name(c.row), port)
+        return StepResult(u, status, c.reason, h, phi, self._name(c.row), port, c.short)
 
     def _correct(
         self, correction: ClosedForm | QPFilter, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows,

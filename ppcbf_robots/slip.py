@@ -2,7 +2,7 @@
 
 Under a held torque the rows of the barrier are kept at the control instants alone; in between phi slips by its
 curvature, and more where masses, friction or delays are not those of the model. What one step predicted for the next,
-``phi + dt psi``, is compared with what came: a bound for this state and this plant, not one over all of X.
+``phi + dt psi`` less what the rise of K_theta is known to take, is compared with what came: a bound for this state and this plant, not one over all of X.
 """
 
 from __future__ import annotations
@@ -53,9 +53,12 @@ class SlipObserver:
                 average_slip(before.phi, before.Lf_phi, before.Lg_phi, u, rows.phi, elapsed, share, self._slip)
         return BarrierRows(rows.h, rows.hdot, rows.phi, lowered(rows.Lf_phi, self._slip), rows.Lg_phi, rows.w)
 
-    def applied(self, t: float, rows: BarrierRows, u: Array) -> None:
-        """Torque u (nv,), gravity included, is applied from t on, where the rows are these."""
-        self._before = (t, rows, u)
+    def applied(self, t: float, rows: BarrierRows, u: Array, short: float) -> None:
+        """Torque u (nv,), gravity included, is applied from t on, where the rows are these.
+
+        By ``short`` [m/s²] phi is known to change less than psi(u) says.
+        """
+        self._before = (t, BarrierRows(rows.h, rows.hdot, rows.phi, rows.Lf_phi - short, rows.Lg_phi, rows.w), u)
 
 
 @kernel
@@ -101,9 +104,9 @@ class SlipBatch:
             average_slips(phi, Lf, Lg, u, rows.phi, t - self._t, LONGEST_GAP * self.dt, self.time, self._slip)
         return BarrierRows(rows.h, rows.hdot, rows.phi, rows.Lf_phi - np.maximum(self._slip, 0.0), rows.Lg_phi, rows.w)
 
-    def applied(self, t: float, rows: BarrierRows, u: Array, which: NDArray[np.bool_]) -> None:
-        """Torques u (B, nv), gravity included, are applied from t on in the runs ``which`` (B,)."""
-        now = [rows.phi, rows.Lf_phi, rows.Lg_phi, u]
+    def applied(self, t: float, rows: BarrierRows, u: Array, short: Array, which: NDArray[np.bool_]) -> None:
+        """Torques u (B, nv), gravity included, are applied from t on in the runs ``which`` (B,); ``short`` is (B,)."""
+        now = [rows.phi, rows.Lf_phi - short[:, None], rows.Lg_phi, u]
         if self._before and not which.all():
             now = [
                 np.where(which.reshape(-1, *[1] * (x.ndim - 1)), x, y) for x, y in zip(now, self._before, strict=True)

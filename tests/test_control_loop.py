@@ -134,8 +134,9 @@ def test_the_slip_is_the_average_of_what_was_predicted_less_what_came():
         share = 1.0 - 0.9**n
         np.testing.assert_allclose(rows.Lf_phi - wary.Lf_phi, np.maximum(share * slip, 0.0), atol=1e-9)
         assert wary.phi is rows.phi and wary.Lg_phi is rows.Lg_phi
-        observer.applied(n * DT, rows, u)
-        phi = phi + DT * (rows.psi(u) - slip)
+        short = rng.uniform()  # what is known beforehand is no slip
+        observer.applied(n * DT, rows, u, short)
+        phi = phi + DT * (rows.psi(u) - short - slip)
     observer.reset()
     np.testing.assert_array_equal(observer.wary(1.0, rows).Lf_phi, rows.Lf_phi)
 
@@ -145,7 +146,7 @@ def test_nothing_is_learned_across_a_gap_or_another_barrier():
     for t, forget in ((1.0, False), (0.0, False), (DT, True)):
         observer = SlipObserver(DT, 0.01)
         observer.wary(0.0, rows)
-        observer.applied(0.0, rows, np.zeros(1))
+        observer.applied(0.0, rows, np.zeros(1), 0.0)
         if forget:
             observer.forget_step()
         np.testing.assert_array_equal(observer.wary(t, later).Lf_phi, 0.0)

@@ -350,8 +350,7 @@ def test_half_of_a_batch_is_drawn_where_margins_are_small(cartpole, monkeypatch)
     sample = descent.sample
     monkeypatch.setattr(descent, "sample", lambda count, pool=None: (pools.append(pool), sample(count, pool))[1])
     descent.iterate()
-    assert [len(p) for p in pools] == [len(descent._crossing), TINY.samples]
-    assert set(pools[1].tolist()) <= set(descent._near.tolist())
+    assert [len(p) for p in pools] == [len(descent._crossing), len(descent._near)]
     assert torch.all(descent._noted[descent._near] < NEAR + descent.margin) or descent.iteration == 1
     assert set(descent._near.tolist()) <= set(descent._crossing.tolist())
 
@@ -368,7 +367,7 @@ def weights_over(descent: MarginDescent, margin: float, count: int, monkeypatch:
 
 
 def test_the_volumes_weight_falls_with_violations_and_grows_without(two_link, monkeypatch):
-    descent, largest = margin_descent(two_link), TINY.volume_weight / 4
+    descent, largest = margin_descent(two_link), TINY.volume_weight / 2
     falling = weights_over(descent, -0.1, 80, monkeypatch)
     assert falling[0] == pytest.approx(WEIGHT_FALL * largest)
     assert np.all(np.diff(falling) <= 0.0)
@@ -435,15 +434,6 @@ def test_states_known_to_violate_make_a_search_needless(panda, monkeypatch):
     margins = margins.abs()
     assert descent.attack(params, known) is known and descent.attack(params, None) is known
     assert searched == [RESERVE, RESERVE]
-
-
-def test_rays_are_drawn_in_proportion_to_what_they_lack(cartpole):
-    descent = margin_descent(cartpole)
-    descent._near = torch.tensor([5, 6, 7])
-    full = NEAR + descent.margin
-    descent._noted[descent._near] = torch.tensor([full, full - 0.01, full - 0.04])
-    share = np.bincount(descent._urgent(20_000).numpy(), minlength=3) / 20_000
-    np.testing.assert_allclose(share, np.array([1e-3, 1e-2, 4e-2]) / 0.051, atol=0.01)
 
 
 def test_the_rate_warms_up_for_a_refinement(two_link):

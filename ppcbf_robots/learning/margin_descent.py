@@ -24,7 +24,7 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 AVERAGING = 0.03  # of the parameters per iteration, in the average that checks and evidence look at
-NEAR = 0.1  # above the wanted margin: rays below it, by what they lack, are drawn as often as all others together
+NEAR = 0.1  # above the wanted margin: rays below it are drawn as often as all others together
 FAR_AWAY = 1.0  # margin noted for rays that do not cross the band
 EXPLORED = 1_600  # new rays per check around those of small margin, and as many with joints that run into bounds
 SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
@@ -32,13 +32,13 @@ POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.25  # factor on the wanted margin per refinement
+STRICTER = 1.1  # factor on the wanted margin per refinement
 MIN_MARGIN, MAX_MARGIN = 0.01, 0.3
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
-TAKEN = 1_500  # states at most that join from one search
+TAKEN = 300  # states at most that join from one search
 ENOUGH = 300  # violating states that end the evidence's search
 RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
-HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
+HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
 
 
 class MarginDescent(Descent):
@@ -51,7 +51,7 @@ class MarginDescent(Descent):
         self.margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
         self._hunt = self.falsifier.start()  # goes on from check to check
         self._first_pool = len(self.rays)
-        self._max_weight, self._simplicity = preset.volume_weight / self._joints**2, preset.simplicity
+        self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
         self._weight: torch.Tensor = torch.tensor(self._max_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
         self.judged = {k: x.detach().clone() for k, x in self.params.items()}
@@ -67,7 +67,7 @@ class MarginDescent(Descent):
         index, s, _ = self.sample(count, self._crossing)
         drawn = len(index)
         if len(self._near):
-            near, s_near, _ = self.sample(count, self._near[self._urgent(count)])
+            near, s_near, _ = self.sample(count, self._near)
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
@@ -96,12 +96,6 @@ class MarginDescent(Descent):
         factor = torch.where(violated, WEIGHT_FALL, WEIGHT_GROWTH)
         self._weight = (self._weight * factor).clamp(LEAST_WEIGHT * self._max_weight, self._max_weight)
 
-    def _urgent(self, count: int) -> torch.Tensor:
-        """Indices into the rays of small margin, drawn in proportion to what each was last seen to lack."""
-        lacking = (NEAR + self.margin - self._noted[self._near]).clamp(min=1e-3).cumsum(0)
-        at = torch.rand(count, generator=self.generator).to(self.device, self.dtype) * lacking[-1]
-        return torch.searchsorted(lacking, at).clamp(max=len(lacking) - 1)
-
     def _shrinkage(self, rays: Rays, s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean of -log s*, of the boundary's s* on each ray, and the mean square of K's change along the motion.
 
@@ -117,10 +111,9 @@ class MarginDescent(Descent):
     def check(self) -> tuple[float, float, float]:
         """Explore, then fresh states on the band without the wanted margin; passivity fails where only its row does."""
         found = self._explore()
-        attack = self.falsifier.search(
-            self.judged, self.preset.search_rounds * self._joints, starts=self._hunt, below=self.margin
-        )
+        attack = self.falsifier.search(self.judged, rounds=self.preset.search_rounds * self._joints, starts=self._hunt)
         self.add_counterexamples(attack.q, attack.v)
+        self._join(self._hunted())
         self._look()
         with torch.no_grad():
             index, s, crosses = self.sample(CHECK_STATES, params=self.judged)
@@ -142,6 +135,11 @@ class MarginDescent(Descent):
         if len(new):
             self._noted[new] = self.band.least_margin(self.params, self.rays.select(new))[0].clamp(max=FAR_AWAY)
         self._near = (crossing & (self._noted < NEAR + self.margin)).nonzero()[:, 0]
+
+    def _hunted(self) -> Rays:
+        """Rays on which the falsifier now sees less than the margin wanted."""
+        points, nv = self._hunt.points[self._hunt.value < self.margin], self.problem.model.nv
+        return self.rays_through(self.problem.model.from_angles(points[:, :nv]), points[:, nv:-1])
 
     def _explore(self) -> float:
         """New rays about those of least margin, and where joints run into bounds; the share of them that violate."""

@@ -29,7 +29,7 @@ class Preset:
     top: int = 100  # closed form: k of Top_k
     l2: float = 0.0  # closed form: weight of the L2 penalty (mean square of the weights)
     simplicity: float = 0.0  # QP: weight of the mean square of the rate of K along the motion
-    volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: its largest, over nv²
+    volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: its largest, over nv
     worst_weight: float = 0.0  # QP: of the mean over violations, beside their sum over the batch
     critic_weight: float = 10.0  # closed form: initial λ of both constraints
     critic_growth: float = 1.01  # closed form: factor on λ after an iteration with violations
@@ -82,7 +82,7 @@ DEFAULT = Preset(
     metric="kinetic",
     learning_rate=3e-3,
     gamma=15.0,
-    volume_weight=1.2,
+    volume_weight=0.6,
     rows_per_ray=12,
     worst_weight=0.5,
     simplicity=1.0,
