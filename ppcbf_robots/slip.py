@@ -2,7 +2,8 @@
 
 Under a held torque the rows of the barrier are kept at the control instants alone; in between phi slips by its
 curvature, and more where masses, friction or delays are not those of the model. What one step predicted for the next,
-``phi + dt psi`` less what the rise of K_theta is known to take, is compared with what came: a bound for this state and this plant, not one over all of X.
+``phi + dt psi`` less what the rise of K_theta is known to take, is compared with what came: a bound for this state and
+this plant, not one over all of X.
 """
 
 from __future__ import annotations

@@ -68,6 +68,9 @@ def test_runs_together_are_the_runs_alone(problem, make_barrier, barrier_name, k
     Not longer than 0.06 s: with random weights a filter may part runs tenfold every 5 ms.
     """
     barrier, config = make_barrier(problem, barrier_name), FilterConfig(kind=kind)
+    if "convex" in barrier_name:  # less steep, or the runs part where a row's shortfall is just tolerated or not
+        barrier.network.params |= {name: np.array(-3.0) for name in ("cone_a", "bowl_a")}
+        barrier.network.params["ba"] -= 3.0
     drawing = Drawing(seed=1, duration=0.06, pushes=True, mass_error=0.2)
     cases = [draw(problem, problem.barrier("lb-cbf"), drawing, i) for i in range(3)]
     for case, run in zip(cases, run_cases(problem, barrier, config, cases, 0.06), strict=True):

@@ -27,7 +27,6 @@ from ppcbf_robots.learning.margin_descent import (
     LEAST_WEIGHT,
     NEAR,
     RESERVE,
-    STRICTER,
     WEIGHT_FALL,
     WEIGHT_GROWTH,
     MarginDescent,
@@ -255,7 +254,7 @@ def test_violations_are_not_converged_and_refined(two_link, monkeypatch):
     trainer, result = train(two_link, on_refine=notes.append)
     assert (result.converged, result.reason) == (False, "3 of 300 uniform band states violate the limits")
     assert notes == ["3 of 300 uniform band states violate the limits: refining"]
-    assert trainer.descent.margin == pytest.approx(STRICTER * TINY.margin)
+    assert trainer.descent._max_weight == pytest.approx(HUMBLER * TINY.volume_weight / 2)
     assert trainer.descent.planned == TINY.iterations + int(TINY.refinement_share * TINY.iterations)
 
 

@@ -32,13 +32,12 @@ POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-STRICTER = 1.1  # factor on the wanted margin per refinement
 MIN_MARGIN, MAX_MARGIN = 0.01, 0.3
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 ENOUGH = 300  # violating states that end the evidence's search
 RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
-HUMBLER = 0.5  # factor on the largest weight of the volume per refinement
+HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
 class MarginDescent(Descent):
@@ -197,21 +196,19 @@ class MarginDescent(Descent):
         self._join(self.rays_through(q, v))
 
     def demand_more(self) -> None:
-        """A larger margin is wanted, and volume weighs less."""
-        self.margin = min(MAX_MARGIN, STRICTER * self.margin)
+        """Volume weighs less, and what depends on q more."""
         self._max_weight *= HUMBLER
         self._simplicity *= SIMPLER
         self._weight = self._weight.clamp(max=self._max_weight)
-        self._look()
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """Rays that joined and the margins noted; weights and margin."""
+        """Rays that joined and the margins noted; weights."""
         added = self.rays.select(slice(self._first_pool, None))
         tensors = {f"rays/{k}": x for k, x in vars(added).items()}
         tensors |= {f"judged/{k}": self.judged[k] for k in self.trained}
         tensors |= {f"hunt/{k}": torch.as_tensor(x) for k, x in vars(self._hunt).items()}
         tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
-        return tensors, {"margin": self.margin, "max_weight": self._max_weight, "simplicity": self._simplicity}
+        return tensors, {"max_weight": self._max_weight, "simplicity": self._simplicity}
 
     def restore(self, tensors: Tensors, numbers: dict[str, Any]) -> None:
         """See :meth:`state`."""
@@ -226,4 +223,4 @@ class MarginDescent(Descent):
         self._noted, self._weight, self._crossing, self._near = (
             tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")
         )
-        self.margin, self._max_weight, self._simplicity = (numbers[k] for k in ("margin", "max_weight", "simplicity"))
+        self._max_weight, self._simplicity = numbers["max_weight"], numbers["simplicity"]
