@@ -63,8 +63,9 @@ def crowd(robot: Robot, pairs: int, seed: int = 0) -> Problem:
 def default_barrier(problem: Problem) -> Barrier:
     """A PP-NCBF of the default preset's size with random small weights."""
     model = problem.model
-    network = NumpyNetwork("convex", random_convex(model.nq, model.nv, HIDDEN, UNITS, np.random.default_rng(0)))
-    return problem.barrier("pp-ncbf", network)
+    params = random_convex(model.nq, model.nv, HIDDEN, UNITS, np.random.default_rng(0))
+    params |= {"energy_a": np.array(-3.0), "energy_scale": np.array(0.1)}
+    return problem.barrier("pp-ncbf", NumpyNetwork("convex", params))
 
 
 def measure(problem: Problem, barrier: Barrier, config: FilterConfig, steps: int) -> Case:

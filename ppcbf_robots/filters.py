@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
 from ppcbf_robots.condense import condense, hessian, hold_at, inside, nearest, pick, verify
-from ppcbf_robots.cutting_planes import shortfall_and_cut, together
+from ppcbf_robots.cutting_planes import EndOfPeriod, together
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -40,7 +40,8 @@ TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests
 LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
 FAST_SHARE = 0.5  # of the way to a bound that one control period may go, where acting late costs nothing
 CUTS = 3  # times that a torque is asked for again because of what K does over the period
-SHORT = 0.4  # of alpha margin, by which a row may fall short over the period: phi still settles above 0
+SHORT = 0.4  # of alpha margin, by which a row may fall short over the period: phi still settles above 0. Far from
+# there it may fall twice as fast as alpha says
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, an arm counts as at rest
 FREE_POWER = 2e-3  # of u_max · v_max, by which a correction may exceed d_p: near rest (9) cannot hold exactly
 GAMMA_PER_RATE = 2.0  # times the least rate / u_max: with more, rows were infeasible in trials
@@ -323,13 +324,14 @@ class QPFilter:
             return answer
         alpha, release, _, margin = self._class_k(allowed is not None)
         bound = alpha * (rows.phi - margin) + release * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+        bound += alpha * (SHORT * margin + np.maximum(0.0, rows.phi - margin))
         every = rows
         for i in range(CUTS + 1):
-            short, cut = shortfall_and_cut(self._convex, dyn, safety, rows, answer.u, self.config.dt)
-            answer = replace(answer, short=short)
-            if i == CUTS or np.min(rows.psi(answer.u) + bound) - short >= -SHORT * alpha * margin:
+            end = EndOfPeriod(self._convex, dyn, safety, rows, self.barrier.spec.gamma, answer.u, self.config.dt)
+            answer = replace(answer, short=end.short)
+            if i == CUTS or np.min(rows.psi(answer.u) + bound) >= end.short:
                 break
-            every = together(every, cut)
+            every = together(every, end.tangent())
             again = self._once(dyn, every, u_des, d_p, u_max, allowed)
             if again.status is not Status.CORRECTING:
                 break
