@@ -416,6 +416,21 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
+@pytest.mark.parametrize(("worst", "rounds"), [(0.003, 2), (0.02, 1), (-0.01, 4)])
+def test_a_margin_below_the_reserve_is_worth_one_refinement(two_link, monkeypatch, worst, rounds):
+    """Clean barriers end the run, violations are refined as long as planned, and too little margin once."""
+    q, v = draw(two_link, 5, seed=2)
+    found = Attack(worst, *((q, v) if worst < RESERVE else (q[:0], v[:0])), 1000)
+    attacked: list[int] = []
+    monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: (attacked.append(self.planned), found)[1])
+    asked: list[float] = []
+    monkeypatch.setattr(MarginDescent, "demand_more", lambda self: asked.append(self.margin))
+    _, result = train(two_link, dataclasses.replace(TINY, refinements=3))
+    assert len(set(attacked)) == rounds
+    assert result.converged == (worst > 0.0) and result.report()["worst_margin"] == worst
+    assert len(asked) == (3 if worst < 0.0 else 0)
+
+
 def test_states_known_to_violate_make_a_search_needless(panda, monkeypatch):
     """They are looked at first; only if the parameters stand them the falsifier searches."""
     descent = margin_descent(panda)

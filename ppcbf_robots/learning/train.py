@@ -22,6 +22,7 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
+RESERVE_ROUNDS = 1  # refinements that states of too little margin are worth, where none violates
 CANDIDATES = 3  # clean parameter sets tried by the evidence
 APART = 5e-3  # of the LB set's volume, by which they differ at least: what is wrong with one is so with its like
 DESCENTS: dict[str, type[Descent]] = {"closed-form": PaperDescent, "qp": MarginDescent}  # by the filter that will run
@@ -94,6 +95,11 @@ class Tested:
         return self.check.violations > 0 or (self.attack is not None and self.attack.worst < 0.0)
 
     @property
+    def stands(self) -> bool:
+        """Whether there were states and none violates, though some may come too close to it."""
+        return self.check.samples > 0 and not self.violates
+
+    @property
     def failures(self) -> int:
         """Violating states found in either way, and those that come too close to it."""
         return self.check.violations + (0 if self.attack is None else len(self.attack.q))
@@ -153,9 +159,10 @@ class Trainer:
                 found = self._evidence()
             except KeyboardInterrupt:
                 found, interrupted = [], True
-            tested = sorted([*tested, *found], key=lambda t: (not t.clean, t.failures, -t.volume_kept))
+            tested = sorted([*tested, *found], key=lambda t: (t.violates, not t.clean, t.failures, -t.volume_kept))
             out_of_time = time.monotonic() - self.started > time_limit
-            if (tested and tested[0].clean) or interrupted or out_of_time or round_ == self.preset.refinements:
+            enough = bool(tested) and (tested[0].clean or (round_ >= RESERVE_ROUNDS and tested[0].stands))
+            if enough or interrupted or out_of_time or round_ == self.preset.refinements:
                 break
             self._refine(found)
             if on_refine is not None:
