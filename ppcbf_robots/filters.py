@@ -39,7 +39,7 @@ ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is chec
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
 LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
 FAST_SHARE = 0.5  # of the way to a bound that one control period may go, where acting late costs nothing
-CUTS = 3  # times that a torque is asked for again because of what K does over the period
+CUTS = 8  # times that a torque is asked for again because of what K does over the period; three light joints took six
 SHORT = 0.4  # of alpha margin, by which a row may fall short over the period: phi still settles above 0. Far from
 # there it may fall twice as fast as alpha says
 NEAR_REST = 5e-3  # of v_max: slower than this on every joint, an arm counts as at rest
