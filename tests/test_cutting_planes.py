@@ -75,6 +75,5 @@ def test_corrections_keep_the_rows_with_the_K_that_the_period_ends_with(two_link
     found = falls_short(two_link, barrier, config, 600)
     monkeypatch.setattr(filters, "CUTS", 0)
     without = falls_short(two_link, barrier, config, 600)
-    print(len(found), np.mean(found > 1.1 * tolerated), np.mean(without > 1.1 * tolerated), without.max(), found.max())
     assert len(found) > 20
     assert np.mean(found > 1.1 * tolerated) < 0.1 < 0.2 < np.mean(without > 1.1 * tolerated)
