@@ -67,20 +67,6 @@ class Barrier(Protocol):
         ...
 
 
-def K_at(network: NumpyNetwork, dyn: Dynamics, v: Any) -> tuple[Any, Any]:
-    """K (...) and ∂K/∂v (..., nv) at the configuration of ``dyn`` and a velocity v (..., nv)."""
-    K, _, K_v = network.value_and_grad(dyn.q, v)
-    return _with_energy(network, dyn, v, K, K_v)
-
-
-def _with_energy(network: NumpyNetwork, dyn: Dynamics, v: Any, K: Any, K_v: Any) -> tuple[Any, Any]:
-    """K and ∂K/∂v with the share of the kinetic energy."""
-    if not network.energy:
-        return K, K_v
-    Mv = (dyn.M @ v[..., None])[..., 0]
-    return K + 0.5 * network.energy * (v * Mv).sum(-1), K_v + network.energy * Mv
-
-
 class RhoBarrier:
     """LB-CBF (no network), NCBF and PP-NCBF."""
 
@@ -91,21 +77,23 @@ class RhoBarrier:
 
     def rows(self, dyn: Dynamics, safety: SafetyRows) -> BarrierRows:
         """Eq. (10), (11), (25) of the paper."""
-        gamma = self.spec.gamma
-        if self.network is None:
+        gamma, network = self.spec.gamma, self.network
+        if network is None:
             K, K_v = np.zeros(dyn.v.shape[:-1]), np.zeros_like(dyn.v)
-            K_q_rate = K
+            K_q_rate, energy = K, 0.0
         else:
-            K, K_q, K_v = self.network.value_and_grad(dyn.q, dyn.v)
-            K_q_rate = (K_q * self.robot.q_rate(dyn.q, dyn.v)).sum(-1)
-            K, K_v = _with_energy(self.network, dyn, dyn.v, K, K_v)
-            K_q_rate = K_q_rate + self.network.energy * (dyn.v * dyn.Cv).sum(-1)  # ½ vᵀ Ṁ v = vᵀ C v
+            K, K_q, K_v = network.value_and_grad(dyn.q, dyn.v)
+            K_q_rate, energy = (K_q * self.robot.q_rate(dyn.q, dyn.v)).sum(-1), network.energy
         if dyn.v.ndim > 1:
+            Mv = (dyn.M @ dyn.v[..., None])[..., 0]
+            K = K + 0.5 * energy * (dyn.v * Mv).sum(-1)
+            K_q_rate = K_q_rate + energy * (dyn.v * dyn.Cv).sum(-1)  # ½ vᵀ Ṁ v = vᵀ C v
+            K_v = K_v + energy * Mv
             hdot = safety.hdot(dyn.v)
             return rho_rows(safety.h, hdot, safety.grad, safety.curvature, dyn.Minv, dyn.b, gamma, K, K_q_rate, K_v)
         found = rho_rows_at(
-            safety.h, safety.grad, safety.drift, safety.curvature, dyn.v, dyn.Minv, dyn.b, gamma, float(K),
-            float(K_q_rate), K_v,
+            safety.h, safety.grad, safety.drift, safety.curvature, dyn.v, dyn.M, dyn.Minv, dyn.Cv, dyn.b, gamma,
+            float(K), float(K_q_rate), K_v, energy,
         )  # fmt: skip
         return BarrierRows(safety.h, *found)
 

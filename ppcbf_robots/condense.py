@@ -159,23 +159,53 @@ def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
 
 @kernel
 def rho_rows_at(
-    h: Any, grad: Any, drift: Any, curvature: Any, v: Any, Minv: Any, b: Any, gamma: float, K: float, K_q_rate: float,
-    K_v: Any,
+    h: Any, grad: Any, drift: Any, curvature: Any, v: Any, M: Any, Minv: Any, Cv: Any, b: Any, gamma: float, K: float,
+    K_q_rate: float, K_v: Any, energy: float,
 ) -> tuple[Any, Any, Any, Any, Any]:  # fmt: skip
-    """ḣ, phi, L_f phi (R,), L_g phi and w (R, nv) of :func:`ppcbf_robots.barriers.rho_rows` at one state."""
+    """ḣ, phi, L_f phi (R,), L_g phi and w (R, nv) of :func:`ppcbf_robots.barriers.rho_rows` at one state.
+
+    K and its derivatives are without the share ``energy`` of the kinetic energy, which is added here.
+    """
     R, nv = grad.shape
-    hdot, phi, Lf, Lg, w = np.empty(R), np.empty(R), np.empty(R), np.empty((R, nv)), np.empty((R, nv))
+    hdot, phi, Lf, w = np.empty(R), np.empty(R), np.empty(R), np.empty((R, nv))
+    slope = np.empty(nv)
+    for i in range(nv):
+        momentum = 0.0
+        for j in range(nv):
+            momentum += M[i, j] * v[j]
+        slope[i] = K_v[i] + energy * momentum
+        K += 0.5 * energy * momentum * v[i]
+        K_q_rate += energy * v[i] * Cv[i]  # ½ vᵀ Ṁ v = vᵀ C v
     for k in range(R):
-        hdot[k], bias = drift[k], 0.0
+        hdot[k] = drift[k]
         for j in range(nv):
             hdot[k] += grad[k, j] * v[j]
-            w[k, j] = grad[k, j] - K_v[j]
-            Lg[k, j] = 0.0
-        for i in range(nv):
-            for j in range(nv):
-                Lg[k, j] += w[k, i] * Minv[i, j]
+            w[k, j] = grad[k, j] - slope[j]
+    Lg = np.dot(w, Minv)
+    for k in range(R):
+        bias = 0.0
         for j in range(nv):
             bias += Lg[k, j] * b[j]
         phi[k] = hdot[k] + gamma * h[k] - K
         Lf[k] = curvature[k] + gamma * hdot[k] - K_q_rate - bias
     return hdot, phi, Lf, Lg, w
+
+
+@kernel
+def falling_short(
+    C: Any, lower: Any, norm: Any, phi: Any, z: Any, short: float, alpha: float, margin: float, share: float,
+    flat: float,
+) -> Any:  # fmt: skip
+    """Indices, rising, of the barrier's rows that a correction z leaves less than what phi_k tolerates.
+
+    The rows are those of :func:`condense`, with ``short`` taken off psi_k; a row tolerates
+    ``alpha (share margin + max(0, phi_k - margin))``, all in units of phi̇.
+    """
+    missed = np.empty(len(phi), dtype=np.bool_)
+    for k in range(len(phi)):
+        residual = -lower[k]
+        for j in range(len(z)):
+            residual += C[k, j] * z[j]
+        tolerated = alpha * (share * margin + max(0.0, phi[k] - margin))
+        missed[k] = residual * max(norm[k], flat) + tolerated < short
+    return np.flatnonzero(missed)

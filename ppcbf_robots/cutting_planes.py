@@ -7,16 +7,33 @@ form a convex set, so the tangent of K at one outside it is a plane that cuts of
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ppcbf_robots.barriers import BarrierRows, K_at
-from ppcbf_robots.kernels import kernel
+from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.network import NumpyNetwork
+from ppcbf_robots.network_kernel import rise
 from ppcbf_robots.robot import Dynamics
-from ppcbf_robots.safety import SafetyRows
 from ppcbf_robots.specs import Array
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """The plane that touches K at the velocity one period ends with, against that at its beginning."""
+
+    short: float  # [m/s²] by which phi changes less over the period than psi(u) says, at least 0 up to rounding
+    turn: Array  # (nv,) what ∂K/∂v changes by
+    drift: float  # by which L_f phi falls
+    steering: Array  # (nv,) by which every row of L_g phi falls
+
+    def of(self, rows: BarrierRows, which: NDArray[np.int_]) -> BarrierRows:
+        """The rows numbered ``which`` with this plane in place of K's tangent at the beginning."""
+        return BarrierRows(
+            rows.h[which], rows.hdot[which], rows.phi[which], rows.Lf_phi[which] - self.drift,
+            rows.Lg_phi[which] - self.steering, rows.w[which] - self.turn,
+        )  # fmt: skip
 
 
 class EndOfPeriod:
@@ -25,57 +42,13 @@ class EndOfPeriod:
     Args:
         network: a convex K_theta.
         dyn: the state.
-        safety: its h and gradients.
-        rows: those of the barrier at that state, L_f phi perhaps lowered.
-        gamma: the barrier's [1/s].
-        u: torque (nv,), gravity included, held over the period.
         dt: control period [s].
-
-    ``short`` is ``(K(q, v⁺) - K(q, v)) / dt - ∂K/∂v · v̇`` [m/s²], at least 0: how much less than ``psi(u)`` phi changes
-    over the period, per second.
     """
 
-    def __init__(
-        self, network: NumpyNetwork, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows, gamma: float, u: Array,
-        dt: float,
-    ) -> None:  # fmt: skip
-        acceleration = dyn.Minv @ (u - dyn.b)
-        K, slope = rows.hdot[0] + gamma * rows.h[0] - rows.phi[0], safety.grad[0] - rows.w[0]
-        K_end, slope_end = K_at(network, dyn, dyn.v + dt * acceleration)
-        rise = float(K_end - K) / dt
-        self.short = rise - float(slope @ acceleration)
-        self._dyn, self._rows, self._turn = dyn, rows, slope_end - slope
-        self._offset = rise - float(slope_end @ acceleration)
+    def __init__(self, network: NumpyNetwork, dyn: Dynamics, dt: float) -> None:
+        self._dyn, self._dt, self._energy, self._K = dyn, dt, network.energy, network.of_velocity(dyn.q)
 
-    def tangent(self) -> BarrierRows:
-        """As many rows as there were, with the tangent of K at v⁺ in place of that at v."""
-        rows, dyn = self._rows, self._dyn
-        Lf, Lg, w = turned(rows.Lf_phi, rows.Lg_phi, rows.w, self._turn, dyn.Minv, dyn.b, self._offset)
-        return BarrierRows(rows.h, rows.hdot, rows.phi, Lf, Lg, w)
-
-
-@kernel
-def turned(Lf: Any, Lg: Any, w: Any, turn: Any, Minv: Any, b: Any, offset: float) -> tuple[Any, Any, Any]:
-    """L_f phi (R,), L_g phi and w (R, nv) with ``w - turn`` in place of w, and L_f phi less ``offset``."""
-    R, nv = w.shape
-    change = np.zeros(nv)  # of every row of L_g phi
-    for i in range(nv):
-        for j in range(nv):
-            change[j] += turn[i] * Minv[i, j]
-    drift = offset
-    for j in range(nv):
-        drift -= change[j] * b[j]
-    Lf_new, Lg_new, w_new = np.empty(R), np.empty((R, nv)), np.empty((R, nv))
-    for k in range(R):
-        Lf_new[k] = Lf[k] - drift
-        for j in range(nv):
-            Lg_new[k, j] = Lg[k, j] - change[j]
-            w_new[k, j] = w[k, j] - turn[j]
-    return Lf_new, Lg_new, w_new
-
-
-def together(first: BarrierRows, second: BarrierRows) -> BarrierRows:
-    """All rows of both."""
-    return BarrierRows(
-        *(np.concatenate(pair) for pair in zip(vars(first).values(), vars(second).values(), strict=True))
-    )
+    def tangent(self, u: Array) -> Tangent:
+        """For a torque u (nv,), gravity included, held over the period."""
+        dyn = self._dyn
+        return Tangent(*rise(dyn.v, u, dyn.M, dyn.Minv, dyn.b, self._dt, self._energy, *self._K))

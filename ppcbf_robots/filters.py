@@ -10,14 +10,14 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.condense import condense, hessian, hold_at, inside, nearest, pick, verify
-from ppcbf_robots.cutting_planes import EndOfPeriod, together
+from ppcbf_robots.condense import condense, falling_short, hessian, hold_at, inside, nearest, pick, verify
+from ppcbf_robots.cutting_planes import EndOfPeriod
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics, RobotModel
@@ -119,6 +119,7 @@ class QPRows:
     lower: Array  # (rows,)
     norm: Array  # (rows,) length before, in units of phi̇ per full torque
     binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
+    source: NDArray[np.int_]  # (rows,) number of each in the safety function, the velocity domain's last
     barrier_rows: int
     box: Box  # (nv,) bounds of z
     limits: str  # what the box holds, in words
@@ -126,7 +127,17 @@ class QPRows:
     def without_speed(self) -> QPRows:
         """The barrier's rows alone."""
         n = self.barrier_rows
-        return QPRows(self.C[:n], self.lower[:n], self.norm[:n], self.binding[:n], n, self.box, self.limits)
+        C, lower, norm, binding, source = (x[:n] for x in self._arrays())
+        return QPRows(C, lower, norm, binding, source, n, self.box, self.limits)
+
+    def after(self, cuts: QPRows) -> QPRows:
+        """More rows of the barrier, and then these."""
+        pairs = zip(cuts._arrays(), self._arrays(), strict=True)
+        C, lower, norm, binding, source = (np.concatenate(pair) for pair in pairs)
+        return QPRows(C, lower, norm, binding, source, cuts.barrier_rows + self.barrier_rows, self.box, self.limits)
+
+    def _arrays(self) -> tuple[Any, ...]:
+        return self.C, self.lower, self.norm, self.binding, self.source
 
 
 class ClosedForm:
@@ -272,6 +283,8 @@ class QPFilter:
         self.solver: QPSolver = make_solver(config.solver)
         network = getattr(barrier, "network", None)
         self._convex = network if network is not None and network.kind == "convex" else None
+        self._gains = self._class_k(False), self._class_k(True)
+        self._every_row = np.arange(safety.rows + 2 * len(safety.v_domain))
 
     def _class_k(self, limited: bool) -> tuple[float, float, float, float]:
         """Class-K gains [1/s]: of the barrier's rows, added where pairs separate, of the velocity domain; margin."""
@@ -286,24 +299,31 @@ class QPFilter:
         hold = np.empty(len(u_des), dtype=np.bool_)
         hold_at(
             rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            *self._class_k(False), _FLAT, ROW_TOLERANCE, hold,
+            *self._gains[False], _FLAT, ROW_TOLERANCE, hold,
         )  # fmt: skip
         return hold
 
     def _condense(
-        self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array, allowed: Box | None
+        self,
+        dyn: Dynamics,
+        rows: BarrierRows,
+        source: NDArray[np.int_],
+        u_des: Array,
+        u_max: Array,
+        allowed: Box | None,
     ) -> tuple[QPRows, int, bool]:
-        count, nv = len(rows.phi) + 2 * len(self.safety.v_domain), len(u_max)
+        """The QP's rows, those of the velocity domain too where ``source`` counts them."""
+        count, nv = len(source), len(u_max)
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
         binding = np.empty(count, dtype=np.bool_)
         lowest, highest = allowed or (-u_max, u_max)
         box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
         hopeless, hold = condense(
             rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            *box, *self._class_k(allowed is not None), _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
+            *box, *self._gains[allowed is not None], _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
         )  # fmt: skip
         limits = "box" if allowed is None else "box and rate"
-        return QPRows(C, lower, norm, binding, len(rows.phi), box, limits), hopeless, hold
+        return QPRows(C, lower, norm, binding, source, len(rows.phi), box, limits), hopeless, hold
 
     def correct(
         self,
@@ -319,35 +339,36 @@ class QPFilter:
 
         ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
         """
-        answer = self._once(dyn, rows, u_des, d_p, u_max, allowed)
-        if answer.status is not Status.CORRECTING or self._convex is None:
-            return answer
-        alpha, release, _, margin = self._class_k(allowed is not None)
-        bound = alpha * (rows.phi - margin) + release * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
-        bound += alpha * (SHORT * margin + np.maximum(0.0, rows.phi - margin))
-        every = rows
-        for i in range(CUTS + 1):
-            end = EndOfPeriod(self._convex, dyn, safety, rows, self.barrier.spec.gamma, answer.u, self.config.dt)
-            answer = replace(answer, short=end.short)
-            if i == CUTS or np.min(rows.psi(answer.u) + bound) >= end.short:
-                break
-            every = together(every, end.tangent())
-            again = self._once(dyn, every, u_des, d_p, u_max, allowed)
-            if again.status is not Status.CORRECTING:
-                break
-            k, added = again.row, len(every.phi) - len(rows.phi)
-            answer = replace(again, row=k if k < 0 else k % len(rows.phi) if k < len(every.phi) else k - added)
-        return answer
-
-    def _once(
-        self, dyn: Dynamics, rows: BarrierRows, u_des: Array, d_p: float | None, u_max: Array, allowed: Box | None
-    ) -> Correction:
-        """The correction for rows whose psi is taken as it is."""
-        qp, hopeless, hold = self._condense(dyn, rows, u_des, u_max, allowed)
+        qp, hopeless, hold = self._condense(dyn, rows, self._every_row, u_des, u_max, allowed)
         if hold and np.all(qp.box[0] <= 0.0) and np.all(qp.box[1] >= 0.0):
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
         answer = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
+        if answer.status is Status.CORRECTING and self._convex is not None:
+            answer = self._with_tangents(EndOfPeriod(self._convex, dyn, self.config.dt), answer, dyn, rows, qp, u_des,
+                                         d_p, u_max, allowed)  # fmt: skip
         return answer if allowed is None else replace(answer, u=np.clip(answer.u, *allowed))
+
+    def _with_tangents(
+        self, K: EndOfPeriod, answer: Correction, dyn: Dynamics, rows: BarrierRows, qp: QPRows, u_des: Array,
+        d_p: float | None, u_max: Array, allowed: Box | None,
+    ) -> Correction:  # fmt: skip
+        """The correction for the K that the period ends with, where ``answer`` lets rows of ``qp`` fall short."""
+        alpha, _, _, margin = self._gains[allowed is not None]
+        first, tangent = qp, K.tangent(answer.u)
+        for _ in range(CUTS):
+            z = (answer.u - u_des) / u_max
+            which = falling_short(
+                first.C, first.lower, first.norm, rows.phi, z, tangent.short, alpha, margin, SHORT, _FLAT
+            )
+            if not len(which):
+                break
+            cuts, hopeless, _ = self._condense(dyn, tangent.of(rows, which), which, u_des, u_max, allowed)
+            qp = qp.after(cuts)
+            again = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
+            if again.status is not Status.CORRECTING:
+                break
+            answer, tangent = again, K.tangent(again.u)
+        return replace(answer, short=tangent.short)
 
     def _ladder(
         self, dyn: Dynamics, qp: QPRows, hopeless: int, u_des: Array, d_p: float | None, u_max: Array
@@ -357,7 +378,7 @@ class QPFilter:
             flat = qp.norm[hopeless] < _FLAT
             reason = "L_g phi is zero on a violated row" if flat else f"a row is out of reach of the torque {qp.limits}"
             z = self._least_violation(dyn, qp, u_max)
-            return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, hopeless)
+            return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, int(qp.source[hopeless]))
         passivity = self._passivity_row(dyn, d_p, u_max)
         solved, reason = self._solve(dyn, qp, passivity, u_max), "constraint active"
         if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
@@ -372,7 +393,9 @@ class QPFilter:
             return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
         z = self._least_violation(dyn, qp, u_max)
         k = int(np.argmax(qp.lower[: qp.barrier_rows]))
-        return self._answer(z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", k)
+        return self._answer(
+            z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", int(qp.source[k])
+        )
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p + free_power as (row, lower) of length 1; None where every torque satisfies it."""
@@ -400,7 +423,7 @@ class QPFilter:
                 return None
             count, tightest, least = verify(qp.C, qp.lower, qp.binding, z, ROW_TOLERANCE, missed)
             if count == 0:
-                return z, tightest if least < TIGHT else -1
+                return z, int(qp.source[tightest]) if least < TIGHT else -1
             if missed[chosen].any():
                 return None  # the solver claims what does not hold
             chosen = np.union1d(chosen, np.flatnonzero(missed))

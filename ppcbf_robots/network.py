@@ -169,6 +169,7 @@ def energy_weight(xp: Any, params: Params) -> Any:
     return _softplus(xp, params["energy_a"]) * params["energy_scale"] if "energy_a" in params else 0.0
 
 
+_OF_Q = 11  # arguments of the compiled convex form that belong to its layers
 _FORMS = {"mlp": _mlp, "convex": _convex}
 
 
@@ -194,11 +195,19 @@ class NumpyNetwork:
         """See :func:`value_and_grad`; a single state is evaluated compiled, ten times faster."""
         if np.ndim(v) > 1:
             return value_and_grad(np, self.kind, self.params, q, v)
+        form = network_kernel.mlp if self.kind == "mlp" else network_kernel.convex
+        K, K_q, K_v = form(q, v, *self._arguments())
+        return np.float64(K), K_q, K_v
+
+    def of_velocity(self, q: Any) -> tuple[Any, ...]:
+        """The convex form at q (nq,) as a function of v alone: the last arguments of ``network_kernel.rise``."""
+        packed = self._arguments()
+        return *network_kernel.convex_units(q, *packed[:_OF_Q]), *packed[_OF_Q:]
+
+    def _arguments(self) -> tuple[Any, ...]:
         if self._packed is None:
             self._packed = self._pack()
-        form = network_kernel.mlp if self.kind == "mlp" else network_kernel.convex
-        K, K_q, K_v = form(q, v, *self._packed)
-        return np.float64(K), K_q, K_v
+        return self._packed
 
     def _pack(self) -> tuple[Any, ...]:
         """Arguments of the compiled form behind q and v."""
@@ -214,8 +223,8 @@ class NumpyNetwork:
         return (
             *common,
             p["turns"],
-            p["v_scale"],
             *heads,
+            p["v_scale"],
             *(p[f"{form}_{k}"] for form in ("cone", "bowl") for k in "abc"),
         )
 

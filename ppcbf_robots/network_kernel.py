@@ -85,54 +85,83 @@ def _sigmoid(x: float) -> float:
 
 
 @kernel
-def convex(
-    q: Any, v: Any, weights: Any, widths: Any, shift: Any, scale: Any, turns: Any, v_scale: Any,
-    Wa: Any, ba: Any, Wb: Any, bb: Any, Wc: Any, bc: Any,
-    cone_a: Any, cone_b: Any, cone_c: Any, bowl_a: Any, bowl_b: Any, bowl_c: Any,
-) -> Any:  # fmt: skip
-    """K, ∂K/∂q and ∂K/∂v of the convex form; Wa, Wc (units, width), Wb (units nv, width) are transposed."""
-    nq, nv, units, width = len(q), len(v), len(ba), widths[-1]
-    slopes = np.empty((len(widths), widths.max()))
-    features = np.empty(3 * nq)
+def _units(
+    q: Any, weights: Any, widths: Any, shift: Any, scale: Any, turns: Any, Wa: Any, ba: Any, Wb: Any, bb: Any,
+    Wc: Any, bc: Any, features: Any, slopes: Any,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """a before its softplus and c (units,), b (units, nv); the layers' input (3 nq,) and slopes are filled in."""
+    nq, units, width = len(q), len(ba), widths[-1]
+    nv = len(bb) // units
     for i in range(nq):
         angle = q[i] * turns[i]
         features[i] = (q[i] - shift[i]) * scale[i]
         features[nq + i], features[2 * nq + i] = math.cos(angle), math.sin(angle)
     x = _hidden(features, weights, widths, slopes)
-    s, round_ = v * v_scale, _softplus(cone_c.item())
-    K_v, g = np.empty(nv), np.zeros(width)
+    a, c, b = np.empty(units), np.empty(units), np.empty((units, nv))
+    for u in range(units):
+        a_u, c_u = ba[u], bc[u]
+        for k in range(width):
+            a_u += Wa[u, k] * x[k]
+            c_u += Wc[u, k] * x[k]
+        a[u], c[u] = a_u, c_u
+        for j in range(nv):
+            b_uj = bb[u * nv + j]
+            for k in range(width):
+                b_uj += Wb[u * nv + j, k] * x[k]
+            b[u, j] = b_uj
+    return a, c, b
+
+
+@kernel
+def _of_velocity(
+    v: Any, a: Any, c: Any, b: Any, v_scale: Any, cone_a: Any, cone_b: Any, cone_c: Any, bowl_a: Any, bowl_b: Any,
+    bowl_c: Any, K_v: Any, parts: Any,
+) -> float:  # fmt: skip
+    """K; ∂K/∂v (nv,) is filled in, and of every unit D and its derivatives with respect to z and c (units, 3)."""
+    nv, round_ = len(v), _softplus(cone_c.item())
     root, bowl = round_**2, -bowl_c.item()
     for j in range(nv):
-        root += (cone_b[j] * s[j]) ** 2
-        bowl += (bowl_b[j] * s[j]) ** 2
+        s = v[j] * v_scale[j]
+        root += (cone_b[j] * s) ** 2
+        bowl += (bowl_b[j] * s) ** 2
     root, along_cone, along_bowl = math.sqrt(root), _softplus(cone_a.item()), _softplus(bowl_a.item())
     K = along_cone * (root - round_) + along_bowl * (_softplus(bowl) - _softplus(-bowl_c.item()))
     for j in range(nv):
         slope = along_cone / root * cone_b[j] ** 2 + 2.0 * along_bowl * _sigmoid(bowl) * bowl_b[j] ** 2
-        K_v[j] = slope * s[j] * v_scale[j]
-    for u in range(units):
-        ra, c = ba[u], bc[u]
-        for k in range(width):
-            ra += Wa[u, k] * x[k]
-            c += Wc[u, k] * x[k]
+        K_v[j] = slope * v[j] * v_scale[j] ** 2
+    for u in range(len(a)):
         z = 0.0
-        b = np.empty(nv)
         for j in range(nv):
-            b[j] = bb[u * nv + j]
-            for k in range(width):
-                b[j] += Wb[u * nv + j, k] * x[k]
-            z += b[j] * s[j]
-        a, sig, sig0 = _softplus(ra), _sigmoid(z + c), _sigmoid(c)
-        D = _softplus(z + c) - _softplus(c) - sig0 * z
-        K += a * D
-        dz = a * (sig - sig0)
-        dc = dz - a * sig0 * (1.0 - sig0) * z
-        da = D * _sigmoid(ra)
+            z += b[u, j] * v[j] * v_scale[j]
+        weight, sig, sig0 = _softplus(a[u]), _sigmoid(z + c[u]), _sigmoid(c[u])
+        D = _softplus(z + c[u]) - _softplus(c[u]) - sig0 * z
+        dz = weight * (sig - sig0)
+        parts[u, 0], parts[u, 1], parts[u, 2] = D, dz, dz - weight * sig0 * (1.0 - sig0) * z
+        K += weight * D
+        for j in range(nv):
+            K_v[j] += dz * b[u, j] * v_scale[j]
+    return K
+
+
+@kernel
+def convex(
+    q: Any, v: Any, weights: Any, widths: Any, shift: Any, scale: Any, turns: Any,
+    Wa: Any, ba: Any, Wb: Any, bb: Any, Wc: Any, bc: Any,
+    v_scale: Any, cone_a: Any, cone_b: Any, cone_c: Any, bowl_a: Any, bowl_b: Any, bowl_c: Any,
+) -> Any:  # fmt: skip
+    """K, ∂K/∂q and ∂K/∂v of the convex form; Wa, Wc (units, width), Wb (units nv, width) are transposed."""
+    nq, nv, units, width = len(q), len(v), len(ba), widths[-1]
+    features, slopes = np.empty(3 * nq), np.empty((len(widths), widths.max()))
+    a, c, b = _units(q, weights, widths, shift, scale, turns, Wa, ba, Wb, bb, Wc, bc, features, slopes)
+    K_v, parts = np.empty(nv), np.empty((units, 3))
+    K = _of_velocity(v, a, c, b, v_scale, cone_a, cone_b, cone_c, bowl_a, bowl_b, bowl_c, K_v, parts)
+    g = np.zeros(width)
+    for u in range(units):
+        da, dz, dc = parts[u, 0] * _sigmoid(a[u]), parts[u, 1], parts[u, 2]
         for k in range(width):
             g[k] += da * Wa[u, k] + dc * Wc[u, k]
         for j in range(nv):
-            K_v[j] += dz * b[j] * v_scale[j]
-            weight = dz * s[j]
+            weight = dz * v[j] * v_scale[j]
             for k in range(width):
                 g[k] += weight * Wb[u * nv + j, k]
     g, K_q = _pull_back(g, weights, widths, slopes), np.empty(nq)
@@ -140,3 +169,59 @@ def convex(
         cos, sin = features[nq + i], features[2 * nq + i]
         K_q[i] = g[i] * scale[i] + turns[i] * (cos * g[2 * nq + i] - sin * g[nq + i])
     return K, K_q, K_v
+
+
+@kernel
+def convex_units(
+    q: Any, weights: Any, widths: Any, shift: Any, scale: Any, turns: Any, Wa: Any, ba: Any, Wb: Any, bb: Any,
+    Wc: Any, bc: Any,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """What the convex form's units are at q: a before its softplus and c (units,), b (units, nv)."""
+    features, slopes = np.empty(3 * len(q)), np.empty((len(widths), widths.max()))
+    return _units(q, weights, widths, shift, scale, turns, Wa, ba, Wb, bb, Wc, bc, features, slopes)
+
+
+@kernel
+def rise(
+    v: Any, u: Any, M: Any, Minv: Any, b: Any, dt: float, energy: float, a: Any, c: Any, units_b: Any,
+    v_scale: Any, cone_a: Any, cone_b: Any, cone_c: Any, bowl_a: Any, bowl_b: Any, bowl_c: Any,
+) -> tuple[float, Any, float, Any]:  # fmt: skip
+    """The convex form, with its share of the kinetic energy, at v and at the v⁺ that torque u leads to in ``dt``.
+
+    Args:
+        v, u: (nv,).
+        M, Minv, b: of the state.
+        dt: [s].
+        energy: weight of the kinetic energy.
+        a, c, units_b: of :func:`convex_units`; parameters of the form follow.
+
+    Returns:
+        ``(K(v⁺) - K(v)) / dt - ∂K/∂v · v̇``; ``turn = ∂K/∂v(v⁺) - ∂K/∂v(v)`` (nv,); what the plane that touches K at v⁺
+        takes off L_f phi, ``(K(v⁺) - K(v)) / dt - ∂K/∂v(v⁺) · v̇ - turnᵀ M⁻¹ b``; and off L_g phi, ``turnᵀ M⁻¹`` (nv,).
+    """
+    nv = len(v)
+    end, K_v, K_end_v, parts = np.empty(nv), np.empty(nv), np.empty(nv), np.empty((len(a), 3))
+    for i in range(nv):
+        end[i] = v[i]
+        for j in range(nv):
+            end[i] += dt * Minv[i, j] * (u[j] - b[j])
+    K = _of_velocity(v, a, c, units_b, v_scale, cone_a, cone_b, cone_c, bowl_a, bowl_b, bowl_c, K_v, parts)
+    K_end = _of_velocity(end, a, c, units_b, v_scale, cone_a, cone_b, cone_c, bowl_a, bowl_b, bowl_c, K_end_v, parts)
+    by_energy, along, along_end = 0.0, 0.0, 0.0
+    for i in range(nv):
+        momentum = change = 0.0
+        for j in range(nv):
+            momentum += M[i, j] * v[j]
+            change += M[i, j] * (end[j] - v[j])
+        by_energy += (momentum + 0.5 * change) * (end[i] - v[i])
+        K_v[i] += energy * momentum
+        K_end_v[i] += energy * (momentum + change)
+        along += K_v[i] * (end[i] - v[i]) / dt
+        along_end += K_end_v[i] * (end[i] - v[i]) / dt
+    rate = (K_end - K + energy * by_energy) / dt
+    turn, steering, drift = K_end_v - K_v, np.zeros(nv), rate - along_end
+    for i in range(nv):
+        for j in range(nv):
+            steering[j] += turn[i] * Minv[i, j]
+            drift -= turn[i] * Minv[i, j] * b[j]
+    return rate - along, turn, drift, steering

@@ -7,6 +7,7 @@ false. The geometry runs compiled (:mod:`ppcbf_robots.kernels`), for one state o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -104,7 +105,7 @@ class SafetyFunction:
     def evaluate(self, dyn: Dynamics, obstacles: Packed | None = None) -> SafetyRows:
         """h and its terms of every row; leading batch axes follow ``dyn``. ``obstacles``: where they are now."""
         lead, nv = dyn.v.shape[:-1], self.robot.nv
-        count = int(np.prod(lead, dtype=int))
+        count = math.prod(lead)
         h, grad, drift, curvature = self._fill(
             dyn.placements.reshape(count, *dyn.placements.shape[-3:]), dyn.J.reshape(count, 6, nv),
             dyn.dJ.reshape(count, 6, nv), dyn.v.reshape(count, nv), self.robot.to_angles(dyn.q).reshape(count, nv),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ppcbf_robots import filters
-from ppcbf_robots.cutting_planes import EndOfPeriod, together
+from ppcbf_robots.cutting_planes import EndOfPeriod
 from ppcbf_robots.filters import FilterConfig, QPFilter, Status
 
 DT = 1e-3
@@ -28,10 +28,10 @@ def test_the_tangent_touches_K_at_the_end_of_the_period_and_lies_below_it_elsewh
     barrier, rng = make_barrier(problem, "pp-ncbf-convex"), np.random.default_rng(0)
     u_max = problem.model.u_max
     for q, v in states(problem, 40):
-        dyn, safety, rows = state(problem, barrier, q, v)
+        dyn, _, rows = state(problem, barrier, q, v)
         u, other = rng.uniform(-1.0, 1.0, (2, problem.model.nv)) * u_max
-        end = EndOfPeriod(barrier.network, dyn, safety, rows, barrier.spec.gamma, u, DT)
-        short, cut = end.short, end.tangent()
+        tangent = EndOfPeriod(barrier.network, dyn, DT).tangent(u)
+        short, cut = tangent.short, tangent.of(rows, np.arange(len(rows.phi)))
         slope = barrier.network.value_and_grad(q, v)[2] + barrier.network.energy * dyn.M @ v
 
         def true_psi(torque, dyn=dyn, rows=rows, slope=slope):
@@ -43,7 +43,7 @@ def test_the_tangent_touches_K_at_the_end_of_the_period_and_lies_below_it_elsewh
         np.testing.assert_allclose(rows.psi(u) - short, true_psi(u), atol=scale)
         np.testing.assert_allclose(cut.psi(u), true_psi(u), atol=scale)
         assert np.all(cut.psi(other) >= true_psi(other) - scale)
-        assert len(together(rows, cut).phi) == 2 * len(rows.phi)
+        np.testing.assert_allclose(cut.w @ dyn.Minv, cut.Lg_phi, atol=1e-9 * np.abs(cut.Lg_phi).max())
 
 
 def falls_short(problem, barrier, config, count):
@@ -58,7 +58,7 @@ def falls_short(problem, barrier, config, count):
         answer = runtime.correct(dyn, safety, rows, u_des, None, u_max)
         assert -1 <= answer.row < len(problem.safety.names)
         if answer.status is Status.CORRECTING and "given up" not in answer.reason:
-            short = EndOfPeriod(barrier.network, dyn, safety, rows, barrier.spec.gamma, answer.u, config.dt).short
+            short = EndOfPeriod(barrier.network, dyn, config.dt).tangent(answer.u).short
             assert answer.short == short
             separating = np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
             bound = config.alpha * (rows.phi - config.margin) + config.fast_alpha * separating
