@@ -19,9 +19,10 @@ import numpy as np
 
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.engines import PinocchioEngine
-from ppcbf_robots.filters import FilterConfig, QPFilter, Status
+from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.qp import QPProblem, QPSolver
+from ppcbf_robots.qp_filter import QPFilter
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.safety_filter import SafetyFilter, StepResult
 from ppcbf_robots.shapes import Motion

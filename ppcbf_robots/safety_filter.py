@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows, RhoBarrier
+from ppcbf_robots.closed_form import ClosedForm
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import Box, ClosedForm, Correction, FilterConfig, QPFilter, Status, is_slow
+from ppcbf_robots.filters import Box, Correction, FilterConfig, Status, is_slow
+from ppcbf_robots.qp_filter import QPFilter
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
 from ppcbf_robots.shapes import Motion, Packed

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ppcbf_robots.filters import ClosedForm, FilterConfig, Status
+from ppcbf_robots.closed_form import ClosedForm
+from ppcbf_robots.filters import FilterConfig, Status
 
 
 @pytest.fixture

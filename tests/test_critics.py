@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from ppcbf_robots.barriers import BarrierRows, rho_rows
+from ppcbf_robots.closed_form import ClosedForm
 from ppcbf_robots.evidence import uniform_band
-from ppcbf_robots.filters import ClosedForm, FilterConfig, Status
+from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning.band import Band
 from ppcbf_robots.learning.critics import closed_form_critics, feasibility
 from ppcbf_robots.learning.linear_program import best_worst_row

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ppcbf_robots import filters
+from ppcbf_robots import qp_filter
 from ppcbf_robots.cutting_planes import EndOfPeriod
-from ppcbf_robots.filters import FilterConfig, QPFilter, Status
+from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.qp_filter import QPFilter
 
 DT = 1e-3
 
@@ -71,9 +72,9 @@ def test_corrections_keep_the_rows_with_the_K_that_the_period_ends_with(two_link
     """With tangents, up to what the margin covers; without them, K's kink lets rows fall short by far more."""
     barrier, config = make_barrier(two_link, "pp-ncbf-convex"), FilterConfig()
     barrier.network.params |= {"cone_a": np.array(0.0), "cone_c": np.array(-8.0)}  # a sharp kink at rest
-    tolerated = filters.SHORT * config.alpha * config.margin
+    tolerated = qp_filter.SHORT * config.alpha * config.margin
     found = falls_short(two_link, barrier, config, 600)
-    monkeypatch.setattr(filters, "CUTS", 0)
+    monkeypatch.setattr(qp_filter, "CUTS", 0)
     without = falls_short(two_link, barrier, config, 600)
     assert len(found) > 20
     assert np.mean(found > 1.1 * tolerated) < 0.1 < 0.2 < np.mean(without > 1.1 * tolerated)

@@ -11,11 +11,13 @@ import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ppcbf_robots import filters
+from ppcbf_robots import qp_filter
 from ppcbf_robots.barriers import EnergyBarrier, RhoBarrier
-from ppcbf_robots.filters import ClosedForm, FilterConfig, QPFilter, Status, free_power
+from ppcbf_robots.closed_form import ClosedForm
+from ppcbf_robots.filters import FilterConfig, Status, free_power
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.qp import QPProblem, make_solver
+from ppcbf_robots.qp_filter import QPFilter
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety import SafetyFunction
@@ -132,16 +134,16 @@ def reference_qp(dyn, rows, u_des, d_p, u_max, barrier, config, v_domain=()):
 @pytest.mark.parametrize("metric", METRICS)
 def test_qp_is_the_least_correction_over_all_rows(problem, states, make_barrier, metric, monkeypatch):
     """Against an active-set solver that is given every row, on random states; statuses must agree as well."""
-    monkeypatch.setattr(filters, "CUTS", 0)  # rows whose psi is taken as it is
+    monkeypatch.setattr(qp_filter, "CUTS", 0)  # rows whose psi is taken as it is
     model, barrier, config = problem.model, make_barrier(problem, "pp-ncbf-convex"), FilterConfig(metric=metric)
-    qp_filter, seen = QPFilter(barrier, problem.safety, config), dict.fromkeys(Status, 0)
+    runtime, seen = QPFilter(barrier, problem.safety, config), dict.fromkeys(Status, 0)
     v_domain = problem.safety.v_domain
     for q, v in states(problem, 120):
         dyn, safety, rows = rows_at(problem, barrier, q, 0.5 * v)
         if rows.h.min() < 0.0:
             continue
         nominal = problem.robot.controller.evaluate(dyn)
-        answer = qp_filter.correct(dyn, safety, rows, nominal.u, float(nominal.d_p), model.u_max)
+        answer = runtime.correct(dyn, safety, rows, nominal.u, float(nominal.d_p), model.u_max)
         budget = float(nominal.d_p) + free_power(model)
         expected = reference_qp(dyn, rows, nominal.u, budget, model.u_max, barrier, config, v_domain)
         status = Status.CORRECTING

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from typer.testing import CliRunner
 
-from ppcbf_robots import filters
+from ppcbf_robots import qp_filter
 from ppcbf_robots.cli.main import app
 from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import FilterConfig, QPFilter, Status, free_power
+from ppcbf_robots.filters import FilterConfig, Status, free_power
+from ppcbf_robots.qp_filter import QPFilter
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -257,7 +258,7 @@ def test_at_full_speed_among_spheres_a_frankas_rate_is_enough(fast_panda, monkey
     assert kept.status.max() == Status.CORRECTING
     assert np.max(kept.V - np.minimum.accumulate(kept.V)) < 1e-3
     assert np.abs(kept.v).max() > 1.5
-    monkeypatch.setattr(filters, "slowest_joint", lambda robot, rate: np.inf)
+    monkeypatch.setattr(qp_filter, "slowest_joint", lambda robot, rate: np.inf)
     quick = run(fast_panda, RATE, task)
     assert np.sum(quick.status >= Status.PASSIVITY_DROPPED) > 10
     assert quick.h.min() < -0.01

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from five_spheres import draw_task
 
-from ppcbf_robots import FilterConfig, Problem, RobotModel, SafetyFilter, Status, load_problem
-from ppcbf_robots import filters as filters_module
+from ppcbf_robots import FilterConfig, Problem, RobotModel, SafetyFilter, Status, load_problem, qp_filter
 from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.engines import PinocchioEngine
 from ppcbf_robots.plant import perturbed
@@ -112,13 +111,13 @@ def plant() -> None:
 
 def rate() -> None:
     """A Franka's 1 N m per ms and less, with class-K gains bounded by the rate and without."""
-    bounded = filters_module.slowest_joint
+    bounded = qp_filter.slowest_joint
     for limit in (np.inf, 1000.0, 500.0):
         for name, slowest in (("bounded", bounded), ("as without", lambda robot, rate: np.inf)):
-            filters_module.slowest_joint = slowest
+            qp_filter.slowest_joint = slowest
             print(f"{limit:g} N m/s | gains {name} | {worst_of(five_spheres(True), FilterConfig(), 1.2, rate=limit)}",
                   flush=True)  # fmt: skip
-    filters_module.slowest_joint = bounded
+    qp_filter.slowest_joint = bounded
 
 
 def delay() -> None:

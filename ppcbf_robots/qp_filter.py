@@ -1,0 +1,278 @@
+"""The runtime filter's correction: the least one that a QP over all rows, torque box and passivity allows."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ppcbf_robots.barriers import Barrier, BarrierRows
+from ppcbf_robots.condense import condense, falling_short, hessian, hold_at, inside, nearest, pick, verify
+from ppcbf_robots.cutting_planes import EndOfPeriod
+from ppcbf_robots.filters import Box, Correction, FilterConfig, Status, free_power, slowest_joint
+from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
+from ppcbf_robots.robot import Dynamics
+from ppcbf_robots.safety import SafetyFunction, SafetyRows
+from ppcbf_robots.specs import Array
+
+log = logging.getLogger(__name__)
+
+Row = tuple[Array, float]  # (n,) of length 1 and its lower bound
+Solution = tuple[Array, int]  # dimensionless correction and the row that it rests on, -1 if none
+
+_TINY = 1e-12
+_FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which no torque steers it
+ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
+TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
+LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
+CUTS = 8  # times that a torque is asked for again because of what K does over the period; three light joints took six
+SHORT = 0.4  # of alpha margin, by which a row may fall short over the period: phi still settles above 0. Far from
+# there it may fall twice as fast as alpha says
+LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared correction in the fallback QP
+
+
+@dataclass(frozen=True)
+class QPRows:
+    """What binds the dimensionless correction z: rows ``C z >= lower``, the barrier's before the velocity domain's, and
+    the box."""
+
+    C: Array  # (rows, nv), of length 1
+    lower: Array  # (rows,)
+    norm: Array  # (rows,) length before, in units of phi̇ per full torque
+    binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
+    source: NDArray[np.int_]  # (rows,) number of each in the safety function, the velocity domain's last
+    barrier_rows: int
+    box: Box  # (nv,) bounds of z
+    limits: str  # what the box holds, in words
+
+    def without_speed(self) -> QPRows:
+        """The barrier's rows alone."""
+        n = self.barrier_rows
+        C, lower, norm, binding, source = (x[:n] for x in self._arrays())
+        return QPRows(C, lower, norm, binding, source, n, self.box, self.limits)
+
+    def after(self, cuts: QPRows) -> QPRows:
+        """More rows of the barrier, and then these."""
+        pairs = zip(cuts._arrays(), self._arrays(), strict=True)
+        C, lower, norm, binding, source = (np.concatenate(pair) for pair in pairs)
+        return QPRows(C, lower, norm, binding, source, cuts.barrier_rows + self.barrier_rows, self.box, self.limits)
+
+    def _arrays(self) -> tuple[Any, ...]:
+        return self.C, self.lower, self.norm, self.binding, self.source
+
+
+class QPFilter:
+    """The QP over near rows, torque box and passivity row, with its ladder of answers when there is no solution.
+
+    Rows are ``psi_k(u) >= -alpha (phi_k - margin) - fast_alpha max(0, min(ḣ_k, phi_k))`` (of the PP-CBF
+    ``psi_k(u) >= -gamma_K phi_k``), the velocity domain's, and ``vᵀ δ <= d_p + FREE_POWER u_max · v_max``. The near
+    rows are those closest to violation by u_des, each in units of the correction it needs; the others are checked
+    afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
+    solution, the velocity domain is given up first, then passivity; then the least violation is sought.
+
+    Where K_theta is convex in v, a torque that lets K rise further by the end of the control period than its rate says
+    is asked for again with K's tangent there (see :mod:`ppcbf_robots.cutting_planes`), as long as a solution is found.
+
+    Under a limited rate no class-K gain is above the least ``rate / u_max`` of all joints: a row that comes into force
+    faster than a torque can be built up finds no solution, and what then follows throws the arm about.
+
+    Args:
+        barrier: gives the rows.
+        safety: what they are rows of.
+        config: settings.
+        rate: of the torques (nv,) [N m/s | N/s]; matters where ``correct`` is given bounds of the torque.
+    """
+
+    def __init__(
+        self, barrier: Barrier, safety: SafetyFunction, config: FilterConfig, rate: Array | None = None
+    ) -> None:
+        self.barrier, self.safety, self.config = barrier, safety, config
+        self.fastest = np.inf if rate is None else slowest_joint(safety.robot, rate)
+        self.solver: QPSolver = make_solver(config.solver)
+        network = getattr(barrier, "network", None)
+        self._convex = network if network is not None and network.kind == "convex" else None
+        self._gains = self._class_k(False), self._class_k(True)
+        self._every_row = np.arange(safety.rows + 2 * len(safety.v_domain))
+
+    def _class_k(self, limited: bool) -> tuple[float, float, float, float]:
+        """Class-K gains [1/s]: of the barrier's rows, added where pairs separate, of the velocity domain; margin."""
+        fastest, fast = self.fastest if limited else np.inf, self.config.fast_alpha
+        if self.barrier.kind == "pp-cbf":
+            return min(self.barrier.spec.gamma_K, fastest), 0.0, min(fast, fastest), 0.0
+        alpha = min(self.config.alpha, fastest)
+        return alpha, min(fast, fastest - alpha), min(fast, fastest), self.config.margin
+
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
+        """Whether :meth:`correct` leaves u_des (B, nv) as it is, (B,), for a batch of states and no limited rate."""
+        hold = np.empty(len(u_des), dtype=np.bool_)
+        hold_at(
+            rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            *self._gains[False], _FLAT, ROW_TOLERANCE, hold,
+        )  # fmt: skip
+        return hold
+
+    def _condense(
+        self,
+        dyn: Dynamics,
+        rows: BarrierRows,
+        source: NDArray[np.int_],
+        u_des: Array,
+        u_max: Array,
+        allowed: Box | None,
+    ) -> tuple[QPRows, int, bool]:
+        """The QP's rows, those of the velocity domain too where ``source`` counts them."""
+        count, nv = len(source), len(u_max)
+        C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
+        binding = np.empty(count, dtype=np.bool_)
+        lowest, highest = allowed or (-u_max, u_max)
+        box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
+        hopeless, hold = condense(
+            rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
+            *box, *self._gains[allowed is not None], _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
+        )  # fmt: skip
+        limits = "box" if allowed is None else "box and rate"
+        return QPRows(C, lower, norm, binding, source, len(rows.phi), box, limits), hopeless, hold
+
+    def correct(
+        self,
+        dyn: Dynamics,
+        safety: SafetyRows,
+        rows: BarrierRows,
+        u_des: Array,
+        d_p: float | None,
+        u_max: Array,
+        allowed: Box | None = None,
+    ) -> Correction:
+        """The least correction in the configured metric, checked before it is returned; ``rows`` say all of safety.
+
+        ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
+        """
+        qp, hopeless, hold = self._condense(dyn, rows, self._every_row, u_des, u_max, allowed)
+        if hold and np.all(qp.box[0] <= 0.0) and np.all(qp.box[1] >= 0.0):
+            return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
+        answer = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
+        if answer.status is Status.CORRECTING and self._convex is not None:
+            answer = self._with_tangents(EndOfPeriod(self._convex, dyn, self.config.dt), answer, dyn, rows, qp, u_des,
+                                         d_p, u_max, allowed)  # fmt: skip
+        return answer if allowed is None else replace(answer, u=np.clip(answer.u, *allowed))
+
+    def _with_tangents(
+        self, K: EndOfPeriod, answer: Correction, dyn: Dynamics, rows: BarrierRows, qp: QPRows, u_des: Array,
+        d_p: float | None, u_max: Array, allowed: Box | None,
+    ) -> Correction:  # fmt: skip
+        """The correction for the K that the period ends with, where ``answer`` lets rows of ``qp`` fall short."""
+        alpha, _, _, margin = self._gains[allowed is not None]
+        first, tangent = qp, K.tangent(answer.u)
+        for _ in range(CUTS):
+            z = (answer.u - u_des) / u_max
+            which = falling_short(
+                first.C, first.lower, first.norm, rows.phi, z, tangent.short, alpha, margin, SHORT, _FLAT
+            )
+            if not len(which):
+                break
+            cuts, hopeless, _ = self._condense(dyn, tangent.of(rows, which), which, u_des, u_max, allowed)
+            qp = qp.after(cuts)
+            again = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
+            if again.status is not Status.CORRECTING:
+                break
+            answer, tangent = again, K.tangent(again.u)
+        return replace(answer, short=tangent.short)
+
+    def _ladder(
+        self, dyn: Dynamics, qp: QPRows, hopeless: int, u_des: Array, d_p: float | None, u_max: Array
+    ) -> Correction:
+        """The QP, and what takes its place where it has no solution."""
+        if hopeless >= 0:
+            flat = qp.norm[hopeless] < _FLAT
+            reason = "L_g phi is zero on a violated row" if flat else f"a row is out of reach of the torque {qp.limits}"
+            z = self._least_violation(dyn, qp, u_max)
+            return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, int(qp.source[hopeless]))
+        passivity = self._passivity_row(dyn, d_p, u_max)
+        solved, reason = self._solve(dyn, qp, passivity, u_max), "constraint active"
+        if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
+            qp, reason = qp.without_speed(), "constraint active, the velocity domain given up"
+            solved = self._solve(dyn, qp, passivity, u_max)
+        if solved is not None:
+            return self._answer(solved[0], u_des, u_max, Status.CORRECTING, reason, solved[1])
+        if passivity is not None:
+            solved = self._solve(dyn, qp, None, u_max)
+        if solved is not None:
+            reason = f"rows and {qp.limits} allow no passive torque"
+            return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
+        z = self._least_violation(dyn, qp, u_max)
+        k = int(np.argmax(qp.lower[: qp.barrier_rows]))
+        return self._answer(
+            z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", int(qp.source[k])
+        )
+
+    def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
+        """vᵀ δ <= d_p + free_power as (row, lower) of length 1; None where every torque satisfies it."""
+        row = -dyn.v * u_max
+        norm = float(np.sqrt(row @ row))
+        if d_p is None or norm < _TINY:
+            return None
+        return row / norm, -(d_p + free_power(self.safety.robot)) / norm
+
+    def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
+        return np.asarray(hessian(dyn.Minv, u_max, self.config.metric == "kinetic"))
+
+    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, u_max: Array) -> Solution | None:
+        """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
+        H, no_row, box = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0), qp.box
+        chosen = nearest(qp.lower, qp.binding, self.config.near_rows)
+        missed = np.empty(len(qp.lower), dtype=np.bool_)
+        for _ in range(4):
+            rows, bounds = pick(qp.C, qp.lower, chosen, *(passivity or no_row), passivity is not None)
+            z = self._ask(QPProblem(H, np.zeros(len(H)), rows, bounds, *box))
+            if z is None:
+                return None
+            z = np.minimum(np.maximum(z, box[0]), box[1])
+            if passivity is not None and not passivity[0] @ z >= passivity[1] - ROW_TOLERANCE:
+                return None
+            count, tightest, least = verify(qp.C, qp.lower, qp.binding, z, ROW_TOLERANCE, missed)
+            if count == 0:
+                return z, int(qp.source[tightest]) if least < TIGHT else -1
+            if missed[chosen].any():
+                return None  # the solver claims what does not hold
+            chosen = np.union1d(chosen, np.flatnonzero(missed))
+        return None
+
+    def _least_violation(self, dyn: Dynamics, qp: QPRows, u_max: Array) -> Array | None:
+        """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted."""
+        n, box = len(u_max), qp.box
+        steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
+        if not len(steerable):
+            return np.clip(np.zeros(n), *box)
+        C, lower = qp.C[steerable], qp.lower[steerable]
+        reach = np.maximum(C * box[0], C * box[1]).sum(-1)
+        lower = np.minimum(lower, reach)  # each row falls short by what is out of its own reach in any case
+        near = nearest(lower, np.ones(len(lower), dtype=np.bool_), self.config.near_rows)
+        H = np.zeros((n + 1, n + 1))
+        H[:n, :n] = self._hessian(dyn, u_max)
+        H[n, n] = LEAST_VIOLATION_WEIGHT
+        rows = np.hstack([C[near], np.ones((len(near), 1))])
+        low, high = np.append(box[0], 0.0), np.append(box[1], 1e6)
+        z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[near], low, high))
+        if z is None or np.any(rows @ z < lower[near] - LOOSE * np.maximum(1.0, np.abs(lower[near]))):
+            return None  # the solver claims less of a violation than there is
+        return np.clip(z[:n], *box)
+
+    def _ask(self, problem: QPProblem) -> Array | None:
+        """The solver's answer if it is one: of the right length and in the box. Whatever a solver raises is none."""
+        try:
+            z = self.solver.solve(problem)
+        except Exception as error:
+            log.warning("the QP solver failed: %s", error)
+            return None
+        if z is None or np.shape(z) != problem.g.shape:
+            return None
+        return z if inside(z, problem.box_low, problem.box_high, LOOSE) else None
+
+    @staticmethod
+    def _answer(z: Array | None, u_des: Array, u_max: Array, status: Status, reason: str, row: int) -> Correction:
+        if z is None:
+            return Correction(u_des, Status.FAULT, "the QP solver gave no usable answer", row)
+        return Correction(np.minimum(np.maximum(u_des + z * u_max, -u_max), u_max), status, reason, row)
