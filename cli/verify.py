@@ -27,11 +27,16 @@ from ppcbf_robots.sweep import run_sweep
 Method = Literal["auto", "proof", "samples"]
 COUNTEREXAMPLES = "counterexamples.npz"
 RECORDS = "verify.jsonl"  # of unfinished samples, in the barrier's folder
+MODEL = "errors of the model: masses, friction, delays, noise"
+MASSES = (
+    "other masses and inertias than those, centres of mass, friction, delays, noise; that the filter, which knows the "
+    "model alone, finds the torque that serves all of them"
+)
 NEVER = [
     "states outside X, below phi = 0, or above the band",
     "the rows that keep the velocity domain: the filter gives them up first",
     "obstacles that move, limits of the torque's rate, and what happens between two control instants",
-    "errors of the model: masses, friction, delays, noise",
+    MODEL,
     "another goal or controller than the one named under `subject`, as far as passivity is concerned",
 ]
 
@@ -44,6 +49,15 @@ def verify(
     power: Annotated[
         float,
         typer.Option(min=0.0, help="Allowed in the passivity row beyond what the filter allows itself [W]; proof."),
+    ] = 0.0,
+    mass_error: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=90.0,
+            metavar="PERCENT",
+            help="One torque for all robots whose links differ by so much in mass and inertia; proof.",
+        ),
     ] = 0.0,
     samples: Annotated[int, typer.Option(min=1, help="Independent states of the band.")] = 69_075,
     confidence: Annotated[float, typer.Option(help="Of the bound of the violation measure.")] = 0.999,
@@ -73,16 +87,18 @@ def verify(
     reason = _no_proof(problem, stored) if method != "samples" else "samples were asked for"
     if method == "proof" and reason:
         raise InputError(f"--method proof: {reason}; use --method samples")
+    if reason and mass_error > 0.0:
+        raise InputError(f"--mass-error is for proofs: {reason}; try masses out with `ppcbf campaign --mass-error`")
     began = time.monotonic()
     if reason:
         if method == "auto":
             err.print(f"samples instead of a proof: {reason}", style="dim", soft_wrap=True)
         found = _sample(problem, stored, folder, samples, confidence, seconds, seed, jobs)
     else:
-        found = _prove(problem, stored, folder, power, jobs, time_limit)
+        found = _prove(problem, stored, folder, power, mass_error / 100.0, jobs, time_limit)
     judged, states, details = found
     certificate = Certificate(
-        overall(judged), judged, subject(stored.data, stored.filter_config().margin), NEVER,
+        overall(judged), judged, subject(stored.data, stored.filter_config().margin), _not_covered(mass_error),
         round(time.monotonic() - began, 2), "samples" if reason else "proof", details,
     )  # fmt: skip
     path = save_certificate(folder, certificate)
@@ -112,10 +128,16 @@ def _no_proof(problem: Problem, stored: StoredBarrier) -> str:
     return obstacle_to_proof(problem, stored) or check_symbolic(problem)
 
 
+def _not_covered(mass_error: float) -> list[str]:
+    return [MASSES if mass_error > 0.0 and x is MODEL else x for x in NEVER]
+
+
 Found = tuple[dict[str, Any], list[tuple[str, list[list[float]]]], dict[str, Any]]
 
 
-def _prove(problem: Problem, stored: StoredBarrier, folder: Path, power: float, jobs: int, time_limit: float) -> Found:
+def _prove(
+    problem: Problem, stored: StoredBarrier, folder: Path, power: float, mass_error: float, jobs: int, time_limit: float
+) -> Found:
     from ppcbf_robots.proof.prove import Search, prove
 
     with _bar("band decided") as show:
@@ -125,11 +147,11 @@ def _prove(problem: Problem, stored: StoredBarrier, folder: Path, power: float, 
             known = f", {bad} counterexamples" if bad else ""
             show(search.share, f"{search.judged:,} boxes, {len(search.boxes):,} open{known}")
 
-        proof = prove(problem, stored, folder, power, jobs, time_limit, on_round)
+        proof = prove(problem, stored, folder, power, jobs, time_limit, on_round, mass_error)
     search = proof.search
     states = [("feasibility", [x.tolist() for x in search.infeasible])]
     states.append(("passivity", [x.tolist() for x in search.impassive]))
-    details = proof.details | {"power": power, "complete": proof.complete}
+    details = proof.details | {"power": power, "mass_error": mass_error, "complete": proof.complete}
     return proof.conditions, states, details
 
 

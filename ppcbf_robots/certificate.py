@@ -58,7 +58,8 @@ class Certificate:
         power = self.details.get("power", 0.0)
         allowance = {"passivity": f" with {power:g} W beyond d_p"} if power else {}
         parts = ", ".join(f"{name} {c.verdict}{allowance.get(name, '')}" for name, c in self.conditions.items())
-        return f"{self.verdict} ({parts})"
+        masses = self.details.get("mass_error", 0.0)
+        return f"{self.verdict} ({parts}{f'; masses within {masses:.3g} of the model' if masses else ''})"
 
     def gap(self, goal: Sequence[float], filter_kind: str, metric: str, alpha: float) -> str:
         """Why it does not speak about a filter and a goal (one number per joint), as a clause; "" if it does."""

@@ -55,16 +55,22 @@ def _joints(robot: RobotModel) -> list[_Joint]:
 
 def forward_dynamics(robot: RobotModel) -> ca.Function:
     """``a = f(angles, v, u)``, all (nv,): M⁻¹ (u - C v - g)."""
+    angles, v, u = (ca.SX.sym(name, robot.nv) for name in "qvu")
+    return ca.Function("a", [angles, v, u], [acceleration(robot, angles, v, u)])
+
+
+def acceleration(robot: RobotModel, angles: Any, v: Any, u: Any, densities: Any = None) -> Any:
+    """M⁻¹ (u - C v - g), (nv,); ``densities`` (nv,) are factors of each link's mass and inertia, by default 1."""
     joints, nv = _joints(robot), robot.nv
-    angles, v, u = ca.SX.sym("q", nv), ca.SX.sym("v", nv), ca.SX.sym("u", nv)
     X, c, I_A, p_A, velocity = [], [], [], [], [ca.SX.zeros(6)]
     for i, joint in enumerate(joints):
         X.append(_to_child(*joint.placement(angles[i])))
         velocity.append(X[i] @ velocity[joint.parent] + joint.S * v[i])
         cross = _cross(velocity[-1])
         c.append(cross @ (joint.S * v[i]))
-        I_A.append(ca.SX(ca.DM(joint.inertia)))
-        p_A.append(-cross.T @ joint.inertia @ velocity[-1])
+        inertia = ca.SX(ca.DM(joint.inertia)) * (1.0 if densities is None else densities[i])
+        I_A.append(inertia)
+        p_A.append(-cross.T @ inertia @ velocity[-1])
     U, D, rest = ([ca.SX()] * nv for _ in range(3))
     for i in reversed(range(nv)):
         S, parent = joints[i].S, joints[i].parent - 1
@@ -74,12 +80,12 @@ def forward_dynamics(robot: RobotModel) -> ca.Function:
             I_a = I_A[i] - U[i] @ U[i].T / D[i]
             I_A[parent] += X[i].T @ I_a @ X[i]
             p_A[parent] += X[i].T @ (p_A[i] + I_a @ c[i] + U[i] * rest[i] / D[i])
-    acceleration, a = [ca.SX(ca.DM(-robot.model.gravity.vector))], ca.SX.zeros(nv)
+    pulled, a = [ca.SX(ca.DM(-robot.model.gravity.vector))], ca.SX.zeros(nv)
     for i, joint in enumerate(joints):
-        pushed = X[i] @ acceleration[joint.parent] + c[i]
+        pushed = X[i] @ pulled[joint.parent] + c[i]
         a[i] = (rest[i] - ca.dot(U[i], pushed)) / D[i]
-        acceleration.append(pushed + joint.S * a[i])
-    return ca.Function("a", [angles, v, u], [a])
+        pulled.append(pushed + joint.S * a[i])
+    return a
 
 
 def _to_child(R: Any, origin: Any) -> Any:

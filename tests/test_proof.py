@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, free_power
 from ppcbf_robots.learning.falsifier import no_network
 from ppcbf_robots.network import NumpyNetwork
+from ppcbf_robots.plant import perturbed
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.proof import affine, network_bounds
 from ppcbf_robots.proof.boxes import OFF_BAND, PROVED, BoxJudge
@@ -164,6 +166,30 @@ def test_rows_stay_in_their_forms(problems, robot, size):
             assert size or np.all(forms[:, -1] < 1e-6 * (1.0 + np.abs(truth)))
 
 
+def test_rows_stay_in_their_forms_whatever_the_links_weigh(problems):
+    problem, size, nv = problems["two_link"], 0.01, 2
+    model, program, rng = problem.model, row_program(problem, with_densities=True), np.random.default_rng(2)
+    for q, v in zip(problem.robot.domain.sample_q(rng, 12), problem.robot.domain.sample_v(rng, 12), strict=True):
+        x, radii = np.concatenate([q, v, np.ones(nv)]), np.append(np.full(2 * nv, size), np.full(nv, 0.2))
+        forms = program(boxed(x, radii))
+        for e in rng.uniform(-1.0, 1.0, (10, 3 * nv)):
+            y = x + radii * e
+            robot = perturbed(model, mass=y[2 * nv :], inertia=y[2 * nv :])
+            dyn = robot.evaluate(y[:nv], y[nv : 2 * nv])
+            s = problem.safety.evaluate(dyn)
+            Lg = s.grad @ dyn.Minv
+            truth = np.concatenate([np.column_stack([Lg, dyn.Minv[None, 0].repeat(len(Lg), 0)]).ravel()])
+            rows = forms[: len(Lg) * (3 + nv)].reshape(len(Lg), 3 + nv, -1)
+            Minv = forms[len(Lg) * (3 + nv) :][:nv]
+            found = np.concatenate([rows[:, 3:], np.broadcast_to(Minv, (len(Lg), *Minv.shape))], axis=1)
+            found = found.reshape(-1, found.shape[-1])
+            miss = np.abs(truth - found[:, 0] - found[:, 1:-1] @ e)
+            assert np.all(miss <= found[:, -1] + 1e-9 * (1.0 + np.abs(truth)))
+            a0 = forms[len(Lg) * (3 + nv) + nv * nv :][:nv]
+            miss = np.abs(-dyn.Minv @ dyn.b - a0[:, 0] - a0[:, 1:-1] @ e)
+            assert np.all(miss <= a0[:, -1] + 1e-9)
+
+
 def test_the_best_torque_is_that_of_a_linear_program():
     rng = np.random.default_rng(3)
     for _ in range(150):
@@ -296,6 +322,56 @@ def test_a_planted_violation_is_never_certified(tmp_path, random_network, learne
         assert not feasible(problem, barrier, x, FilterConfig(), passive=False)
     for x in proof.search.impassive[:50]:
         assert on_band(problem, barrier, x) and not feasible(problem, barrier, x, FilterConfig())
+
+
+def serves_all(problem, barrier, x, config, mass_error, passive):
+    """Whether one torque satisfies the rows of robots with links as light, as heavy, and anything between, by scipy."""
+    nv, A, b = problem.model.nv, [], []
+    rng = np.random.default_rng(0)
+    draws = [*itertools.product((-1.0, 1.0), repeat=nv), *rng.uniform(-1.0, 1.0, (10, nv))]
+    for draw in draws:
+        factors = 1.0 + mass_error * np.array(draw)
+        dyn = perturbed(problem.model, mass=factors, inertia=factors).evaluate(x[:nv], x[nv:])
+        rows = barrier.rows(dyn, problem.safety.evaluate(dyn))
+        separating = config.fast_alpha * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+        A.append(-rows.Lg_phi)
+        b.append(rows.Lf_phi + config.alpha * (rows.phi - config.margin) + separating)
+    if passive:
+        nominal = problem.robot.controller.evaluate(problem.model.evaluate(x[:nv], x[nv:]))
+        A.append(x[None, nv:])
+        b.append(np.array([x[nv:] @ nominal.u + nominal.d_p + free_power(problem.model)]))
+    bounds = [(-u, u) for u in problem.model.u_max]
+    return linprog(np.zeros(nv), np.vstack(A), np.concatenate(b) + 1e-9, bounds=bounds).status == 0
+
+
+def test_a_proof_for_all_masses_within_an_interval(tmp_path, random_network):
+    """One torque for all of them: proved at 3 %; at 20 %, and with little force, refuted."""
+    problem = small_problem()
+    saved = stored(problem, tmp_path, mild_network(random_network))
+    barrier, config = saved.barrier(problem), FilterConfig()
+    proof = prove(problem, saved, tmp_path, 0.0, 1, 600.0, lambda s: None, 0.03)
+    assert proof.complete and {c.verdict for c in proof.conditions.values()} == {"proved"}
+    assert "differ by 3 % at most" in proof.conditions["feasibility"].statement
+    q, v, _ = independent_band(problem, barrier, 100, np.random.default_rng(0))
+    assert all(serves_all(problem, barrier, x, config, 0.03, True) for x in np.concatenate([q, v], axis=1))
+
+    weak = small_problem(7.5)
+    saved = stored(weak, tmp_path, mild_network(random_network))
+    refuted = prove(weak, saved, tmp_path, 0.0, 1, 10.0, lambda s: None, 0.2)
+    assert refuted.conditions["feasibility"].verdict == "refuted" and refuted.search.infeasible
+    for x in refuted.search.infeasible[:30]:
+        assert on_band(weak, barrier, x) and not serves_all(weak, barrier, x, config, 0.2, passive=False)
+
+
+def test_boxes_that_are_proved_for_the_model_alone_are_not_for_other_masses(random_network):
+    weak, network, config = small_problem(7.5), mild_network(random_network), FilterConfig()
+    barrier, rng = weak.barrier("pp-ncbf", network), np.random.default_rng(0)
+    q, v, _ = independent_band(weak, barrier, 600, rng)
+    states = [x for x in np.concatenate([q, v], axis=1) if not serves_all(weak, barrier, x, config, 0.2, False)]
+    boxes, rows = np.array([[x - 1e-5, x + 1e-5] for x in states]), np.zeros(len(states), np.bool_)
+    alone, among = (BoxJudge(weak, network, config, 0.0, share)(boxes, rows) for share in (0.0, 0.2))
+    assert np.sum(alone.status == PROVED) >= 2 and not np.any(among.status == PROVED)
+    assert among.suspect.all()
 
 
 def test_a_separating_pair_that_the_spring_pulls_back_lacks_passivity(tmp_path):

@@ -43,22 +43,27 @@ class BoxJudge:
         network: convex form of K_theta.
         config: the QP filter.
         power: [W] that the passivity row is given beyond what the filter allows itself.
+        mass_error: largest share by which each link's mass and inertia may differ from the model's. The one torque that
+            a box needs then serves all of them; they are symbols of the forms that are never cut.
 
     Raises:
         InputError: for obstacles that have no symbolic form.
     """
 
-    def __init__(self, problem: Problem, network: NumpyNetwork, config: FilterConfig, power: float) -> None:
+    def __init__(
+        self, problem: Problem, network: NumpyNetwork, config: FilterConfig, power: float, mass_error: float = 0.0
+    ) -> None:
         model, spec, domain = problem.model, problem.robot.spec.barrier, problem.robot.domain
         assert model.nv <= JOINTS and network.kind == "convex"
-        self._program = row_program(problem)
+        self._program = row_program(problem, with_densities=mass_error > 0.0)
         self._net = network_bounds.pack(network, model)
         self.low = np.concatenate([domain.q[:, 0], domain.v[:, 0]])  # (2 nv,) of X
         self.high = np.concatenate([domain.q[:, 1], domain.v[:, 1]])
         u_max = np.ones(JOINTS)
         u_max[: model.nv] = model.u_max
         self._settings = (problem.safety.rows, spec.gamma, config.alpha, config.margin, spec.epsilon, u_max,
-                          free_power(model) + power, 1.0 / (self.high - self.low), config.fast_alpha)  # fmt: skip
+                          free_power(model) + power, 1.0 / (self.high - self.low), config.fast_alpha,
+                          model.nv if mass_error > 0.0 else 0, mass_error)  # fmt: skip
 
     def __call__(self, boxes: Array, passive: NDArray[np.bool_]) -> Verdicts:
         """Verdicts on boxes (B, 2, 2 nv) of lower and upper corners (angles, velocities).
@@ -80,10 +85,12 @@ def judge(
     status: Any, cut: Any, Lg: Any, suspect: Any, excess: Any, point: Any,
 ) -> None:  # fmt: skip
     """Fill the arrays of :class:`Verdicts`; boxes that follow each other with equal q share their layers' bounds."""
-    rows, inverse_width = settings[0], settings[7]
+    rows, inverse_width, densities, mass_error = settings[0], settings[7], settings[9], settings[10]
     size = boxes.shape[2]
-    nv, planes = size // 2, size + 2
-    state, positions = np.zeros((size, planes)), np.zeros((nv, nv + 2))
+    nv, planes = size // 2, size + densities + 2
+    state, positions = np.zeros((size + densities, planes)), np.zeros((nv, nv + 2))
+    for i in range(size, size + densities):
+        state[i, 0], state[i, 1 + i] = 1.0, mass_error * affine.UP
     work, model = np.empty((registers, planes)), np.empty((outputs, planes))
     phi, A, B = np.empty((rows, planes)), np.empty((rows + 1, planes)), np.zeros((rows + 1, JOINTS, planes))
     known, head = False, np.empty((0, 0, 0))
@@ -111,9 +118,9 @@ def _rows(model: Any, state: Any, head: Any, net: Any, settings: Any, phi: Any, 
     and with phi_k >= 0, as it is on the band; the one after the last row ``power + v · (u_rest - u)``.
     """
     rows, gamma, alpha, margin, fast_alpha = settings[0], settings[1], settings[2], settings[3], settings[8]
-    nv, planes = len(state) // 2, state.shape[1]
+    nv, planes = (len(state) - settings[9]) // 2, state.shape[1]
     K, K_q_rate, K_v = np.empty(planes), np.empty(planes), np.empty((nv, planes))
-    v = state[nv:]
+    v = state[nv : 2 * nv]
     network_bounds.bounds(head, v, net, K, K_q_rate, K_v)
     Minv, a0, power = rows * (3 + nv), rows * (3 + nv) + nv * nv, rows * (3 + nv) + nv * nv + nv
     form, learned, pushed = np.empty(planes), K_q_rate.copy(), np.zeros((nv, planes))
@@ -155,7 +162,8 @@ def _decide(
 ) -> None:  # fmt: skip
     """Verdict on box b, with ``half`` its half widths relative to X."""
     rows, epsilon, u_max = settings[0], settings[4], settings[5]
-    nv, planes, widest = len(state) // 2, state.shape[1], np.argmax(half)
+    size, planes, widest = len(half), state.shape[1], np.argmax(half)
+    nv = size // 2
     cut[b] = widest
     on_band, only = 0, -1  # rows whose phi may be in the band, and one of them
     for k in range(rows):
@@ -201,7 +209,7 @@ def _decide(
         scale[c] = abs(at[c, 1]) * u_max[0] + abs(at[c, 2]) * u_max[1] + affine.TINY
         weight[c] = scale[c]
         blurred = blurred or rest > CLEAR * scale[c]
-    proved, cost = count == 0, np.zeros(planes - 2)
+    proved, cost = count == 0, np.zeros(size)
     for attempt in range(3):  # the second weighs the constraints by how far they reach under the first's torque
         if count == 0:
             break
@@ -227,7 +235,15 @@ def _decide(
         proved = worst >= 0.0
         if proved or slack < 0.0:
             break
-    for i in range(planes - 2):
+        if attempt == 2 and size < planes - 2 and not phi[only, planes - 1] > CLEAR * epsilon:
+            for c in range(count):  # at the point itself, for all densities
+                k = binding[c]
+                _under(A[k], B[k], u, forms)
+                value = _value(forms, e) - forms[planes - 1]
+                for i in range(size, planes - 2):
+                    value -= abs(forms[1 + i])
+                suspect[b] = suspect[b] or value < FAIL
+    for i in range(size):
         point[b, i] = min(box[1, i], max(box[0, i], state[i, 0] + e[i] * state[i, 1 + i]))
     if not proved:
         cut[b] = np.argmax(cost)
@@ -280,11 +296,11 @@ def _add_cost(f: Any, phi: Any, multiplier: float, epsilon: float, half: Any, fa
 
     What phi explains of a form ranges over the band's width all the same, unless the box is smaller.
     """
-    n, squares, reach = len(half), 0.0, affine.TINY
+    n, last, squares, reach = len(half), len(f) - 1, 0.0, affine.TINY
     for i in range(n):
         squares += half[i] * half[i]
         reach += abs(phi[1 + i])
-    rest = f[n + 1] + abs(multiplier) * phi[n + 1]
+    rest = f[last] + abs(multiplier) * phi[last]
     across = abs(multiplier) * min(0.5 * epsilon, reach) / reach
     for i in range(n):
         linear = abs(f[1 + i] - multiplier * phi[1 + i]) + across * abs(phi[1 + i])

@@ -18,7 +18,7 @@ from ppcbf_robots.kernels import exact_kernel
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.proof import affine
 from ppcbf_robots.specs import Array
-from ppcbf_robots.symbolic import forward_dynamics, potential_energy, safety_rows
+from ppcbf_robots.symbolic import acceleration, potential_energy, safety_rows
 
 OPERATIONS = (
     "CONST", "INPUT", "OUTPUT", "ASSIGN", "ADD", "SUB", "MUL", "NEG", "TWICE", "SQ", "DIV", "INV", "SQRT", "SIN", "COS",
@@ -57,20 +57,22 @@ class Layout:
         self.size = self.u_rest + nv
 
 
-def row_program(problem: Problem) -> Program:
+def row_program(problem: Problem, with_densities: bool = False) -> Program:
     """Program of inputs (q, v), joint angles, and the outputs of :class:`Layout`.
 
     Per row k: h, ``ḣ = ∇h v``, ``L_f rho = vᵀ ∇²h v + gamma ḣ - ∇h M⁻¹ b`` and ``L_g rho = ∇h M⁻¹``. Then M⁻¹,
     ``-M⁻¹ b``, ``v · u_rest`` and u_rest, the nominal torque at rest; the passivity row is ``v · (u - u_rest) <= 0``.
+    ``with_densities`` adds factors (nv,) of each link's mass and inertia to the inputs, of which the controller and so
+    u_rest know nothing.
 
     Raises:
         InputError: for obstacles or body pairs that :func:`ppcbf_robots.symbolic.safety_rows` does not know.
     """
     model, nv, gamma = problem.model, problem.model.nv, problem.robot.spec.barrier.gamma
-    q, v, u = (ca.SX.sym(name, nv) for name in "qvu")
+    q, v, u, densities = (ca.SX.sym(name, nv) for name in ("q", "v", "u", "densities"))
     h = safety_rows(problem.safety)(q)
-    acceleration = forward_dynamics(model)(q, v, u)
-    Minv, a0 = ca.jacobian(acceleration, u), ca.substitute(acceleration, u, ca.SX.zeros(nv))
+    a = acceleration(model, q, v, u, densities if with_densities else None)
+    Minv, a0 = ca.jacobian(a, u), ca.substitute(a, u, ca.SX.zeros(nv))
     grad = ca.jacobian(h, q)
     hdot = grad @ v
     drift = ca.jtimes(hdot, q, v) + gamma * hdot + grad @ a0
@@ -78,7 +80,8 @@ def row_program(problem: Problem) -> Program:
     gravity = ca.gradient(potential_energy(model)(q), q)
     u_rest = rest_torque(problem.robot.controller, q, gravity)
     outputs = [ca.vec(rows), ca.vec(Minv), a0, ca.dot(v, u_rest), u_rest]
-    return compiled(ca.Function("rows", [ca.vertcat(q, v)], ca.cse([ca.vertcat(*outputs)])))
+    inputs = ca.vertcat(q, v, densities) if with_densities else ca.vertcat(q, v)
+    return compiled(ca.Function("rows", [inputs], ca.cse([ca.vertcat(*outputs)])))
 
 
 def rest_torque(controller: NominalController, angles: Any, gravity: Any) -> Any:

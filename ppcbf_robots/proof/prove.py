@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import logging
 from collections.abc import Callable
@@ -18,10 +19,11 @@ from ppcbf_robots.certificate import Condition, Verdict
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import FilterConfig, Status, free_power
+from ppcbf_robots.plant import perturbed
 from ppcbf_robots.problem import Problem
-from ppcbf_robots.proof.boxes import BoxJudge
+from ppcbf_robots.proof.boxes import FAIL, BoxJudge
 from ppcbf_robots.proof.branch_and_bound import Search, begin, load_search, run, save_search
-from ppcbf_robots.proof.witness import JOINTS
+from ppcbf_robots.proof.witness import JOINTS, best_torque
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array
 
@@ -78,8 +80,11 @@ def prove(
     threads: int,
     seconds: float,
     on_round: Callable[[Search], None],
+    mass_error: float = 0.0,
 ) -> Proof:
     """Prove, or go on with the proof in ``folder``, that the QP filter has a solution on the whole band.
+
+    With ``mass_error``, that one torque satisfies its rows for every robot near the model.
 
     Args:
         problem: robot, world and controller, with the goal that u_des aims at.
@@ -89,6 +94,7 @@ def prove(
         threads: boxes are judged by so many at once.
         seconds: after which to stop.
         on_round: called after every round of boxes.
+        mass_error: largest share by which each link's mass and inertia may differ from the model's.
 
     Raises:
         InputError: for obstacles that have no symbolic form.
@@ -96,16 +102,20 @@ def prove(
     """
     problem = problem.with_barrier_spec(stored.spec)
     barrier, config, passive = stored.barrier(problem), stored.filter_config(), stored.kind == "pp-ncbf"
-    judge = BoxJudge(problem, stored.network, config, power)
+    judge = BoxJudge(problem, stored.network, config, power, mass_error)
     q, v, tried = uniform_band(problem, barrier, MARKERS, np.random.default_rng(0))
     if not len(q):
         raise CheckFailed(f"none of {tried:,} uniform states of X lies on the band: the safe set has collapsed")
-    path, identity = folder / STATE, _identity(problem, stored, config, power)
+    path, identity = folder / STATE, _identity(problem, stored, config, power, mass_error)
     search = load_search(path, identity)
     if search is None:
         markers = np.concatenate([problem.model.to_angles(q), v], axis=1)
         search = begin(judge, passive, markers)
-    confirm = _filter_fails(problem, barrier, config, power)
+    confirm = (
+        _no_common_torque(problem, barrier, config, power, mass_error)
+        if mass_error > 0.0
+        else _filter_fails(problem, barrier, config, power)
+    )
     run(search, judge, confirm, threads, seconds, on_round, lambda s: save_search(s, identity, path))
     if search.done:
         path.unlink(missing_ok=True)
@@ -113,7 +123,9 @@ def prove(
     leaving = sum(_separates(problem, barrier, x) for x in search.impassive)
     separating = leaving / max(1, len(search.impassive))
     rows = problem.safety.names[: problem.safety.rows]
-    return Proof(search, _conditions(problem, stored, search, power, band), search.done, band, separating, rows)
+    return Proof(
+        search, _conditions(problem, stored, search, power, band, mass_error), search.done, band, separating, rows
+    )
 
 
 def _separates(problem: Problem, barrier: Barrier, x: Array) -> bool:
@@ -124,10 +136,10 @@ def _separates(problem: Problem, barrier: Barrier, x: Array) -> bool:
     return bool(safety.hdot(dyn.v)[barrier.rows(dyn, safety).phi.argmin()] > 0.0)
 
 
-def _identity(problem: Problem, stored: StoredBarrier, config: FilterConfig, power: float) -> str:
+def _identity(problem: Problem, stored: StoredBarrier, config: FilterConfig, power: float, mass_error: float) -> str:
     """SHA-256 of all that a proof depends on."""
     about = [VERSION, stored.data["weights_sha256"], problem.fingerprint(), problem.robot.goal.tolist(), vars(config),
-             stored.spec.model_dump(), stored.kind, power]  # fmt: skip
+             stored.spec.model_dump(), stored.kind, power, mass_error]  # fmt: skip
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
@@ -160,12 +172,52 @@ def _filter_fails(
     return quietly
 
 
+def _no_common_torque(
+    problem: Problem, barrier: Barrier, config: FilterConfig, power: float, mass_error: float
+) -> Callable[[Array, bool], bool]:
+    """Whether no torque at a state of the band serves all robots with every link as light or as heavy as may be.
+
+    By the linear program over their rows together, each row's constant term and factors exact up to rounding.
+    """
+    nv, safety = problem.model.nv, problem.safety
+    corners = [perturbed(problem.model, mass=x, inertia=x)
+               for x in itertools.product((1.0 - mass_error, 1.0 + mass_error), repeat=nv)]  # fmt: skip
+    u_max = np.ones(JOINTS)
+    u_max[:nv] = problem.model.u_max
+
+    def fails(x: Array, passive: bool) -> bool:
+        q, v = problem.model.from_angles(x[:nv]), x[nv:]
+        A, B = [], []
+        for robot in corners:
+            dyn = robot.evaluate(q, v)
+            rows = barrier.rows(dyn, safety.evaluate(dyn))
+            if rows.h.min() < 0.0 or not 0.0 <= rows.phi.min() <= barrier.spec.epsilon:
+                return False
+            separating = config.fast_alpha * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+            A.append(rows.Lf_phi + config.alpha * (rows.phi - config.margin) + separating)
+            B.append(rows.Lg_phi)
+        if passive:
+            nominal = problem.robot.controller.evaluate(problem.model.evaluate(q, v))
+            budget = float(nominal.d_p + v @ nominal.u) + free_power(problem.model) + power
+            A.append(np.array([budget]))
+            B.append(-v[None])
+        constant, factors = np.concatenate(A), np.zeros((sum(map(len, A)), JOINTS))
+        factors[:, :nv] = np.concatenate(B)
+        weight = np.abs(factors) @ u_max + 1e-12
+        return best_torque(constant, factors, weight, len(constant), u_max, np.zeros(JOINTS)) < FAIL
+
+    return fails
+
+
 def _conditions(
-    problem: Problem, stored: StoredBarrier, search: Search, power: float, band: float
+    problem: Problem, stored: StoredBarrier, search: Search, power: float, band: float, mass_error: float
 ) -> dict[str, Condition]:
     """Verdicts of all conditions."""
     epsilon, rows = stored.spec.epsilon, problem.safety.rows
     on_band = f"on the whole band {{0 <= min_k phi_k <= {epsilon:g}, h >= 0}} in X"
+    if mass_error > 0.0:
+        percent = f"{100.0 * mass_error:g} %"
+        on_band += f", for all robots at once whose links' masses and inertias differ by {percent} at most"
     failed = len(search.infeasible)
     verdict = _verdict(failed, search.done and search.undecided_volume == 0.0)
     share = search.undecided_volume / band
