@@ -17,7 +17,15 @@ import typer
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.campaign import Drawing, draw, outcome, run_cases, total
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, alarms_expected, emit_json, out, table
-from ppcbf_robots.cli.simulate import choose_barrier, described, mujoco_engine
+from ppcbf_robots.cli.simulate import (
+    BarrierOption,
+    EngineOption,
+    FilterOption,
+    MetricOption,
+    choose_barrier,
+    described,
+    mujoco_engine,
+)
 from ppcbf_robots.cli.tasks import DaskOption, run_tasks
 from ppcbf_robots.engines import EngineName
 from ppcbf_robots.errors import CheckFailed, InputError
@@ -101,16 +109,10 @@ def campaign(
     robot: RobotArgument,
     obstacles: WorldArgument,
     rollouts: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of runs.")] = 100,
-    barrier: Annotated[str, typer.Option(help="Barrier folder, or lb-cbf, pp-cbf, none.")] = "lb-cbf",
-    filter: Annotated[
-        FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")
-    ] = None,
-    metric: Annotated[
-        Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")
-    ] = None,
-    engine: Annotated[
-        EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")
-    ] = "pinocchio",
+    barrier: BarrierOption = "lb-cbf",
+    filter: FilterOption = None,
+    metric: MetricOption = None,
+    engine: EngineOption = "pinocchio",
     duration: Annotated[float, typer.Option(min=0.01, max=600.0, help="Simulated seconds of each run.")] = 5.0,
     pushes: Annotated[
         bool, typer.Option("--pushes", help="Push the arm 1 to 3 times a run; a joint gains up to 10 % of v_max.")

@@ -23,6 +23,12 @@ from ppcbf_robots.rollout import simulate as rollout
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array, vector
 
+BarrierOption = Annotated[str, typer.Option(help="Barrier folder, or lb-cbf, pp-cbf, none.")]
+FilterOption = Annotated[FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")]
+MetricOption = Annotated[Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")]
+EngineOption = Annotated[
+    EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")
+]
 EffortRateOption = Annotated[
     float | None, typer.Option(help="How fast torques may change [N m/s]; else the robot spec's `effort_rate`.")
 ]
@@ -31,13 +37,9 @@ EffortRateOption = Annotated[
 def simulate(
     robot: RobotArgument,
     obstacles: WorldArgument,
-    barrier: Annotated[str, typer.Option(help="Barrier folder, or lb-cbf, pp-cbf, none.")] = "lb-cbf",
-    filter: Annotated[
-        FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")
-    ] = None,
-    metric: Annotated[
-        Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")
-    ] = None,
+    barrier: BarrierOption = "lb-cbf",
+    filter: FilterOption = None,
+    metric: MetricOption = None,
     solver: Annotated[
         str, typer.Option(help="daqp, proxqp, or a solver installed for qpsolvers.")
     ] = FilterConfig.solver,
@@ -47,9 +49,7 @@ def simulate(
     duration: Annotated[float, typer.Option(min=0.001, max=3600.0, help="Simulated seconds.")] = 10.0,
     rate: Annotated[float, typer.Option(min=10.0, max=2000.0, help="Control rate [Hz].")] = 1000.0,
     effort_rate: EffortRateOption = None,
-    engine: Annotated[
-        EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")
-    ] = "pinocchio",
+    engine: EngineOption = "pinocchio",
     out_file: Annotated[Path, typer.Option("--out", metavar="T.npz")] = Path("trajectory.npz"),
     json: JsonOption = False,
 ) -> None:

@@ -54,7 +54,7 @@ def verify(
         float,
         typer.Option(
             min=0.0,
-            max=90.0,
+            max=30.0,
             metavar="PERCENT",
             help="One torque for all robots whose links differ by so much in mass and inertia; proof.",
         ),

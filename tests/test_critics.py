@@ -11,6 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import settings as tries
 from hypothesis import strategies as st
+from ray_helpers import CPU, DOUBLE, make_field, make_rays, tensors
 from scipy.optimize import linprog
 
 from ppcbf_robots.barriers import BarrierRows, rho_rows
@@ -20,39 +21,18 @@ from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning.band import Band
 from ppcbf_robots.learning.critics import closed_form_critics, feasibility
 from ppcbf_robots.learning.linear_program import best_worst_row
-from ppcbf_robots.learning.rays import Field, Rays, rays_at, to_tensors
+from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
 from ppcbf_robots.network import NumpyNetwork, random_convex
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.safety_filter import SafetyFilter
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CPU, DOUBLE = torch.device("cpu"), torch.float64
 
 
 @pytest.fixture(params=["mlp", "convex"])
 def network(request, problem, random_network) -> NumpyNetwork:
     """Random weights of both forms for each problem."""
     return random_network(request.param, problem.model.nq, problem.model.nv, seed=1)
-
-
-def tensors(params: dict[str, Any]) -> dict[str, torch.Tensor]:
-    return {k: torch.as_tensor(x, dtype=DOUBLE) for k, x in params.items()}
-
-
-def draw(problem: Problem, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform states of X."""
-    rng, domain = np.random.default_rng(seed), problem.robot.domain
-    return problem.model.from_angles(domain.sample_q(rng, count)), domain.sample_v(rng, count)
-
-
-def make_rays(problem: Problem, count: int = 200, rows: int = 1000, seed: int = 0) -> Rays:
-    """Free rays in double precision, with all rows unless fewer are asked for."""
-    arrays, _, free = rays_at(problem, *draw(problem, count, seed), rows)
-    return Rays(**to_tensors([{k: x[free] for k, x in arrays.items()}], CPU, DOUBLE))
-
-
-def make_field(problem: Problem, kind: str) -> Field:
-    return Field(problem.model, kind, problem.robot.spec.barrier.gamma, CPU, DOUBLE)
 
 
 # The closed form

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ray_helpers import draw
 from safetensors import safe_open
 from safetensors.torch import save_file
 
@@ -51,12 +52,6 @@ TINY_PAPER = dataclasses.replace(TINY, network="mlp", filter="closed-form", metr
 def network(problem, random_network) -> NumpyNetwork:
     """Random weights for each problem."""
     return random_network("convex", problem.model.nq, problem.model.nv, seed=1)
-
-
-def draw(problem: Problem, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform states of X."""
-    rng, domain = np.random.default_rng(seed), problem.robot.domain
-    return problem.model.from_angles(domain.sample_q(rng, count)), domain.sample_v(rng, count)
 
 
 def margin_descent(problem: Problem, preset: Preset = TINY) -> MarginDescent:

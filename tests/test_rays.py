@@ -8,43 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ray_helpers import DOUBLE, draw, make_field, make_rays, tensors
 
 from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.learning.presets import DEFAULT
-from ppcbf_robots.learning.rays import FAR, Field, Rays, build_pool, rays_at, to_tensors
+from ppcbf_robots.learning.rays import FAR, Rays, build_pool, rays_at
 from ppcbf_robots.learning.train import Trainer
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem, load_problem
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-CPU, DOUBLE = torch.device("cpu"), torch.float64
 
 
 @pytest.fixture(params=["mlp", "convex"])
 def network(request, problem, random_network) -> NumpyNetwork:
     """Random weights of both forms for each problem."""
     return random_network(request.param, problem.model.nq, problem.model.nv, seed=1)
-
-
-def tensors(params: dict[str, Any]) -> dict[str, torch.Tensor]:
-    return {k: torch.as_tensor(x, dtype=DOUBLE) for k, x in params.items()}
-
-
-def draw(problem: Problem, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform states of X."""
-    rng, domain = np.random.default_rng(seed), problem.robot.domain
-    return problem.model.from_angles(domain.sample_q(rng, count)), domain.sample_v(rng, count)
-
-
-def make_rays(problem: Problem, count: int = 200, rows: int = 1000, seed: int = 0) -> Rays:
-    """Free rays in double precision, with all rows unless fewer are asked for."""
-    arrays, _, free = rays_at(problem, *draw(problem, count, seed), rows)
-    return Rays(**to_tensors([{k: x[free] for k, x in arrays.items()}], CPU, DOUBLE))
-
-
-def make_field(problem: Problem, kind: str) -> Field:
-    return Field(problem.model, kind, problem.robot.spec.barrier.gamma, CPU, DOUBLE)
 
 
 def runtime_rows(problem: Problem, network: NumpyNetwork, q: Any, v: Any) -> BarrierRows:
