@@ -75,6 +75,40 @@ def condense(
 
 
 @kernel
+def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
+    """``W`` in the dimensionless correction, M⁻¹ or 1 scaled by u_max on both sides, with mean diagonal 1."""
+    n = len(u_max)
+    H, trace = np.zeros((n, n)), 0.0
+    for i in range(n):
+        for j in range(n):
+            if kinetic or i == j:
+                H[i, j] = (Minv[i, j] if kinetic else 1.0) * u_max[i] * u_max[j]
+        trace += H[i, i]
+    return H * (n / trace)
+
+
+@kernel
+def dimensionless(
+    hdot: Any, phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
+    lowest: Any, highest: Any, kinetic: bool, alpha: float, release: float, speed_alpha: float, margin: float,
+    flat: float, tolerance: float, C: Any, lower: Any, norm: Any, binding: Any, low: Any, high: Any,
+) -> tuple[int, bool, Any]:  # fmt: skip
+    """:func:`condense` with the box of z, low and high (nv,), from torques ``lowest`` and ``highest`` (nv,).
+
+    Returns what that does, u_des within its bounds being one more thing that has to hold, and :func:`hessian`.
+    """
+    inside = True
+    for j in range(len(v)):
+        low[j], high[j] = (lowest[j] - u_des[j]) / u_max[j], (highest[j] - u_des[j]) / u_max[j]
+        inside = inside and low[j] <= 0.0 and high[j] >= 0.0
+    hopeless, hold = condense(
+        hdot, phi, Lf, Lg, Minv, b, v, v_domain, u_des, u_max, low, high, alpha, release, speed_alpha, margin, flat,
+        tolerance, C, lower, norm, binding,
+    )  # fmt: skip
+    return hopeless, hold and inside, hessian(Minv, u_max, kinetic)
+
+
+@kernel
 def hold_at(
     hdot: Any, phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
     alpha: float, release: float, speed_alpha: float, margin: float, flat: float, tolerance: float, hold: Any,
@@ -90,6 +124,15 @@ def hold_at(
         )  # fmt: skip
         for j in range(nv):
             hold[s] = hold[s] and low[j] <= 0.0 and high[j] >= 0.0
+
+
+@kernel
+def nearest(lower: Any, binding: Any, count: int) -> Any:
+    """Indices, rising, of the ``count`` binding rows most in need of a correction; row 0 if none binds."""
+    found = np.flatnonzero(binding)
+    if len(found) > count:
+        found = np.sort(found[np.argsort(-lower[found])[:count]])
+    return found if len(found) > 0 else np.zeros(1, dtype=np.int64)
 
 
 @kernel
@@ -109,12 +152,11 @@ def pick(C: Any, lower: Any, chosen: Any, row: Any, bound: float, with_row: bool
 
 
 @kernel
-def nearest(lower: Any, binding: Any, count: int) -> Any:
-    """Indices, rising, of the ``count`` binding rows most in need of a correction; row 0 if none binds."""
-    found = np.flatnonzero(binding)
-    if len(found) > count:
-        found = np.sort(found[np.argsort(-lower[found])[:count]])
-    return found if len(found) > 0 else np.zeros(1, dtype=np.int64)
+def near(C: Any, lower: Any, binding: Any, count: int, row: Any, bound: float, with_row: bool) -> tuple[Any, Any, Any]:
+    """Indices of the :func:`nearest` rows, and what :func:`pick` makes of them."""
+    chosen = nearest(lower, binding, count)
+    rows, bounds = pick(C, lower, chosen, row, bound, with_row)
+    return chosen, rows, bounds
 
 
 @kernel
@@ -136,6 +178,22 @@ def verify(C: Any, lower: Any, binding: Any, z: Any, tolerance: float, missed: A
 
 
 @kernel
+def accept(
+    C: Any, lower: Any, binding: Any, low: Any, high: Any, row: Any, bound: float, with_row: bool, tolerance: float,
+    answer: Any, missed: Any,
+) -> tuple[Any, int, int, float]:  # fmt: skip
+    """A solver's answer (nv,) put into the box, and what :func:`verify` says of it; -1 rows if the one more fails."""
+    z, power = np.empty(len(answer)), 0.0
+    for j in range(len(z)):
+        z[j] = min(max(answer[j], low[j]), high[j])
+        power += row[j] * z[j]
+    if with_row and not power >= bound - tolerance:
+        return z, -1, -1, np.inf
+    count, tightest, least = verify(C, lower, binding, z, tolerance, missed)
+    return z, count, tightest, least
+
+
+@kernel
 def inside(z: Any, low: Any, high: Any, tolerance: float) -> bool:
     """Whether every entry of z (n,) is finite and within its bounds."""
     found = True
@@ -145,16 +203,16 @@ def inside(z: Any, low: Any, high: Any, tolerance: float) -> bool:
 
 
 @kernel
-def hessian(Minv: Any, u_max: Any, kinetic: bool) -> Any:
-    """``W`` in the dimensionless correction, M⁻¹ or 1 scaled by u_max on both sides, with mean diagonal 1."""
-    n = len(u_max)
-    H, trace = np.zeros((n, n)), 0.0
-    for i in range(n):
-        for j in range(n):
-            if kinetic or i == j:
-                H[i, j] = (Minv[i, j] if kinetic else 1.0) * u_max[i] * u_max[j]
-        trace += H[i, i]
-    return H * (n / trace)
+def power_row(v: Any, u_max: Any, budget: float, tiny: float) -> tuple[Any, float, bool]:
+    """``vᵀ δ <= budget`` as a row (nv,) of z, of length 1, and its lower bound; whether it is one at all."""
+    row, square = np.empty(len(v)), 0.0
+    for j in range(len(v)):
+        row[j] = -v[j] * u_max[j]
+        square += row[j] * row[j]
+    norm = math.sqrt(square)
+    if norm < tiny:
+        return row, 0.0, False
+    return row / norm, -budget / norm, True
 
 
 @kernel

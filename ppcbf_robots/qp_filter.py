@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.condense import condense, falling_short, hessian, hold_at, inside, nearest, pick, verify
+from ppcbf_robots.condense import accept, dimensionless, falling_short, hold_at, inside, near, nearest, pick, power_row
 from ppcbf_robots.cutting_planes import EndOfPeriod
 from ppcbf_robots.filters import Box, Correction, FilterConfig, Status, free_power, slowest_joint
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
@@ -36,8 +36,10 @@ LEAST_VIOLATION_WEIGHT = 1e4  # of the squared violation against the squared cor
 
 @dataclass(frozen=True)
 class QPRows:
-    """What binds the dimensionless correction z: rows ``C z >= lower``, the barrier's before the velocity domain's, and
-    the box."""
+    """The QP but for its passivity row: of the dimensionless correction z, rows ``C z >= lower`` and a box.
+
+    The barrier's rows come before the velocity domain's.
+    """
 
     C: Array  # (rows, nv), of length 1
     lower: Array  # (rows,)
@@ -45,6 +47,7 @@ class QPRows:
     binding: NDArray[np.bool_]  # (rows,) whether some torque in the box breaks the row
     source: NDArray[np.int_]  # (rows,) number of each in the safety function, the velocity domain's last
     barrier_rows: int
+    H: Array  # (nv, nv) metric of z
     box: Box  # (nv,) bounds of z
     limits: str  # what the box holds, in words
 
@@ -52,13 +55,14 @@ class QPRows:
         """The barrier's rows alone."""
         n = self.barrier_rows
         C, lower, norm, binding, source = (x[:n] for x in self._arrays())
-        return QPRows(C, lower, norm, binding, source, n, self.box, self.limits)
+        return QPRows(C, lower, norm, binding, source, n, self.H, self.box, self.limits)
 
     def after(self, cuts: QPRows) -> QPRows:
         """More rows of the barrier, and then these."""
         pairs = zip(cuts._arrays(), self._arrays(), strict=True)
         C, lower, norm, binding, source = (np.concatenate(pair) for pair in pairs)
-        return QPRows(C, lower, norm, binding, source, cuts.barrier_rows + self.barrier_rows, self.box, self.limits)
+        count = cuts.barrier_rows + self.barrier_rows
+        return QPRows(C, lower, norm, binding, source, count, self.H, self.box, self.limits)
 
     def _arrays(self) -> tuple[Any, ...]:
         return self.C, self.lower, self.norm, self.binding, self.source
@@ -95,6 +99,7 @@ class QPFilter:
         network = getattr(barrier, "network", None)
         self._convex = network if network is not None and network.kind == "convex" else None
         self._gains = self._class_k(False), self._class_k(True)
+        self._free_power, self._kinetic = free_power(safety.robot), config.metric == "kinetic"
         self._every_row = np.arange(safety.rows + 2 * len(safety.v_domain))
 
     def _class_k(self, limited: bool) -> tuple[float, float, float, float]:
@@ -126,15 +131,15 @@ class QPFilter:
         """The QP's rows, those of the velocity domain too where ``source`` counts them."""
         count, nv = len(source), len(u_max)
         C, lower, norm = np.empty((count, nv)), np.empty(count), np.empty(count)
-        binding = np.empty(count, dtype=np.bool_)
+        binding, low, high = np.empty(count, dtype=np.bool_), np.empty(nv), np.empty(nv)
         lowest, highest = allowed or (-u_max, u_max)
-        box = ((lowest - u_des) / u_max, (highest - u_des) / u_max)
-        hopeless, hold = condense(
+        hopeless, hold, H = dimensionless(
             rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            *box, *self._gains[allowed is not None], _FLAT, ROW_TOLERANCE, C, lower, norm, binding,
+            lowest, highest, self._kinetic, *self._gains[allowed is not None], _FLAT, ROW_TOLERANCE,
+            C, lower, norm, binding, low, high,
         )  # fmt: skip
         limits = "box" if allowed is None else "box and rate"
-        return QPRows(C, lower, norm, binding, source, len(rows.phi), box, limits), hopeless, hold
+        return QPRows(C, lower, norm, binding, source, len(rows.phi), H, (low, high), limits), hopeless, hold
 
     def correct(
         self,
@@ -151,7 +156,7 @@ class QPFilter:
         ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
         """
         qp, hopeless, hold = self._condense(dyn, rows, self._every_row, u_des, u_max, allowed)
-        if hold and np.all(qp.box[0] <= 0.0) and np.all(qp.box[1] >= 0.0):
+        if hold:
             return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
         answer = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
         if answer.status is Status.CORRECTING and self._convex is not None:
@@ -179,7 +184,7 @@ class QPFilter:
             if again.status is not Status.CORRECTING:
                 break
             answer, tangent = again, K.tangent(again.u)
-        return replace(answer, short=tangent.short)
+        return Correction(answer.u, answer.status, answer.reason, answer.row, tangent.short)
 
     def _ladder(
         self, dyn: Dynamics, qp: QPRows, hopeless: int, u_des: Array, d_p: float | None, u_max: Array
@@ -188,21 +193,21 @@ class QPFilter:
         if hopeless >= 0:
             flat = qp.norm[hopeless] < _FLAT
             reason = "L_g phi is zero on a violated row" if flat else f"a row is out of reach of the torque {qp.limits}"
-            z = self._least_violation(dyn, qp, u_max)
+            z = self._least_violation(qp)
             return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, int(qp.source[hopeless]))
         passivity = self._passivity_row(dyn, d_p, u_max)
-        solved, reason = self._solve(dyn, qp, passivity, u_max), "constraint active"
+        solved, reason = self._solve(qp, passivity), "constraint active"
         if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
             qp, reason = qp.without_speed(), "constraint active, the velocity domain given up"
-            solved = self._solve(dyn, qp, passivity, u_max)
+            solved = self._solve(qp, passivity)
         if solved is not None:
             return self._answer(solved[0], u_des, u_max, Status.CORRECTING, reason, solved[1])
         if passivity is not None:
-            solved = self._solve(dyn, qp, None, u_max)
+            solved = self._solve(qp, None)
         if solved is not None:
             reason = f"rows and {qp.limits} allow no passive torque"
             return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
-        z = self._least_violation(dyn, qp, u_max)
+        z = self._least_violation(qp)
         k = int(np.argmax(qp.lower[: qp.barrier_rows]))
         return self._answer(
             z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", int(qp.source[k])
@@ -210,53 +215,49 @@ class QPFilter:
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p + free_power as (row, lower) of length 1; None where every torque satisfies it."""
-        row = -dyn.v * u_max
-        norm = float(np.sqrt(row @ row))
-        if d_p is None or norm < _TINY:
+        if d_p is None:
             return None
-        return row / norm, -(d_p + free_power(self.safety.robot)) / norm
+        row, lower, binds = power_row(dyn.v, u_max, d_p + self._free_power, _TINY)
+        return (row, lower) if binds else None
 
-    def _hessian(self, dyn: Dynamics, u_max: Array) -> Array:
-        return np.asarray(hessian(dyn.Minv, u_max, self.config.metric == "kinetic"))
-
-    def _solve(self, dyn: Dynamics, qp: QPRows, passivity: Row | None, u_max: Array) -> Solution | None:
+    def _solve(self, qp: QPRows, passivity: Row | None) -> Solution | None:
         """The QP over the near rows, checked against all rows; None if there is no solution or the check fails."""
-        H, no_row, box = self._hessian(dyn, u_max), (np.zeros(len(u_max)), 0.0), qp.box
-        chosen = nearest(qp.lower, qp.binding, self.config.near_rows)
+        zero, passive = np.zeros(len(qp.H)), passivity is not None
+        one_more = passivity or (zero, 0.0)
+        chosen, rows, bounds = near(qp.C, qp.lower, qp.binding, self.config.near_rows, *one_more, passive)
         missed = np.empty(len(qp.lower), dtype=np.bool_)
         for _ in range(4):
-            rows, bounds = pick(qp.C, qp.lower, chosen, *(passivity or no_row), passivity is not None)
-            z = self._ask(QPProblem(H, np.zeros(len(H)), rows, bounds, *box))
-            if z is None:
+            answer = self._ask(QPProblem(qp.H, zero, rows, bounds, *qp.box))
+            if answer is None:
                 return None
-            z = np.minimum(np.maximum(z, box[0]), box[1])
-            if passivity is not None and not passivity[0] @ z >= passivity[1] - ROW_TOLERANCE:
-                return None
-            count, tightest, least = verify(qp.C, qp.lower, qp.binding, z, ROW_TOLERANCE, missed)
+            z, count, tightest, least = accept(
+                qp.C, qp.lower, qp.binding, *qp.box, *one_more, passive, ROW_TOLERANCE, answer, missed
+            )
             if count == 0:
                 return z, int(qp.source[tightest]) if least < TIGHT else -1
-            if missed[chosen].any():
+            if count < 0 or missed[chosen].any():
                 return None  # the solver claims what does not hold
             chosen = np.union1d(chosen, np.flatnonzero(missed))
+            rows, bounds = pick(qp.C, qp.lower, chosen, *one_more, passive)
         return None
 
-    def _least_violation(self, dyn: Dynamics, qp: QPRows, u_max: Array) -> Array | None:
+    def _least_violation(self, qp: QPRows) -> Array | None:
         """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted."""
-        n, box = len(u_max), qp.box
+        n, box = len(qp.H), qp.box
         steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
         if not len(steerable):
             return np.clip(np.zeros(n), *box)
         C, lower = qp.C[steerable], qp.lower[steerable]
         reach = np.maximum(C * box[0], C * box[1]).sum(-1)
         lower = np.minimum(lower, reach)  # each row falls short by what is out of its own reach in any case
-        near = nearest(lower, np.ones(len(lower), dtype=np.bool_), self.config.near_rows)
+        few = nearest(lower, np.ones(len(lower), dtype=np.bool_), self.config.near_rows)
         H = np.zeros((n + 1, n + 1))
-        H[:n, :n] = self._hessian(dyn, u_max)
+        H[:n, :n] = qp.H
         H[n, n] = LEAST_VIOLATION_WEIGHT
-        rows = np.hstack([C[near], np.ones((len(near), 1))])
+        rows = np.hstack([C[few], np.ones((len(few), 1))])
         low, high = np.append(box[0], 0.0), np.append(box[1], 1e6)
-        z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[near], low, high))
-        if z is None or np.any(rows @ z < lower[near] - LOOSE * np.maximum(1.0, np.abs(lower[near]))):
+        z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[few], low, high))
+        if z is None or np.any(rows @ z < lower[few] - LOOSE * np.maximum(1.0, np.abs(lower[few]))):
             return None  # the solver claims less of a violation than there is
         return np.clip(z[:n], *box)
 
