@@ -256,20 +256,20 @@ def rows_at(
     moving = np.array([np.any(motions[o] != 0.0) for o in range(O)])
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
-        row = 0
-        for i in range(P):
-            at = (p[i, 0], p[i, 1], p[i, 2])
-            velocity, acceleration = (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2])
-            for o in range(O):
+        for o in range(O):
+            kind, size, frame, motion, moves = kinds[o], sizes[o], frames[o], motions[o], moving[o]
+            first, end = plane_start[o], plane_start[o + 1]
+            for i in range(P):
                 d, h_t, second, n0, n1, n2 = _obstacle_row(
-                    at, velocity, acceleration, kinds[o], sizes[o], planes, plane_start[o], plane_start[o + 1],
-                    frames[o], motions[o], moving[o],
+                    (p[i, 0], p[i, 1], p[i, 2]), (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2]),
+                    kind, size, planes, first, end, frame, motion, moves,
                 )  # fmt: skip
+                row = i * O + o
                 h[s, row] = d - radii[i] - margins[o]
                 drift[s, row], curvature[s, row] = h_t, second
                 for j in range(nv):
                     grad[s, row, j] = n0 * Jp[i, 0, j] + n1 * Jp[i, 1, j] + n2 * Jp[i, 2, j]
-                row += 1
+        row = P * O
         for k in range(len(self_pairs)):
             a, b = self_pairs[k, 0], self_pairs[k, 1]
             square = along = speed = push = 0.0
