@@ -68,7 +68,7 @@ def default_barrier(problem: Problem) -> Barrier:
     """
     model, rng = problem.model, np.random.default_rng(0)
     params = random_convex(model.nq, model.nv, HIDDEN, UNITS, rng)
-    params |= {"v_scale": 1.0 / model.v_max, "ba": np.full(UNITS, -3.0), "bb": rng.normal(0.0, 2.0, UNITS * model.nv)}
+    params |= {"v_scale": 1.0 / model.v_max, "ba": np.full(UNITS, -3.0), "bb": rng.normal(0.0, 1.0, UNITS * model.nv)}
     params |= {"cone_a": np.array(-2.5), "cone_b": np.full(model.nv, 0.2), "cone_c": np.array(-3.4)}
     params |= {"bowl_a": np.array(-3.2), "bowl_b": np.full(model.nv, 1.1), "bowl_c": np.array(5.5)}
     if model.nv > COVERED_JOINTS:
