@@ -67,9 +67,9 @@ class ClosedForm:
             return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
         return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
 
-    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
-        """As :meth:`QPFilter.passes`; nothing is known before each state is looked at."""
-        return np.zeros(len(u_des), dtype=np.bool_)
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[NDArray[np.bool_], Array]:
+        """As :meth:`ppcbf_robots.qp_filter.QPFilter.passes`; nothing is known before each state is looked at."""
+        return np.zeros(len(u_des), dtype=np.bool_), np.zeros(len(u_des))
 
     def _damp(self, dyn: Dynamics, safety: SafetyRows, k: int, u_des: Array) -> Correction:
         """PP-CBF: the least damper ``δ = -λ D v`` (D = I, or M in the kinetic metric), implicit over one period.

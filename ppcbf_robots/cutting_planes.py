@@ -8,13 +8,15 @@ form a convex set, so the tangent of K at one outside it is a plane that cuts of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import BarrierRows
+from ppcbf_robots.kernels import kernel
 from ppcbf_robots.network import NumpyNetwork
-from ppcbf_robots.network_kernel import rise
+from ppcbf_robots.network_kernel import convex_units, rise
 from ppcbf_robots.robot import Dynamics
 from ppcbf_robots.specs import Array
 
@@ -52,3 +54,25 @@ class EndOfPeriod:
         """For a torque u (nv,), gravity included, held over the period."""
         dyn = self._dyn
         return Tangent(*rise(dyn.v, u, dyn.M, dyn.Minv, dyn.b, self._dt, self._energy, *self._K))
+
+
+@kernel
+def hold_to_the_end(
+    q: Any, v: Any, u: Any, M: Any, Minv: Any, b: Any, dt: float, energy: float, layers: Any, form: Any,
+    hdot: Any, phi: Any, Lf: Any, Lg: Any, alpha: float, release: float, margin: float, share: float,
+    hold: Any, short: Any,
+) -> None:  # fmt: skip
+    """Clear ``hold`` (B,) where torques u (B, nv) let a row fall short over the period; fill in ``short`` (B,) there.
+
+    See ``condense.falling_short``.
+    """
+    for s in range(len(hold)):
+        if hold[s]:
+            a, c, units_b = convex_units(q[s], *layers)
+            short[s] = rise(v[s], u[s], M[s], Minv[s], b[s], dt, energy, a, c, units_b, *form)[0]
+            for k in range(phi.shape[1]):
+                slack = Lf[s, k] + alpha * (phi[s, k] - margin) + release * max(0.0, min(hdot[s, k], phi[s, k]))
+                for j in range(len(u[s])):
+                    slack += Lg[s, k, j] * u[s, j]
+                if slack + alpha * (share * margin + max(0.0, phi[s, k] - margin)) < short[s]:
+                    hold[s] = False

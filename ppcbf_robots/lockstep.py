@@ -71,15 +71,15 @@ def simulate_together(
         q[over], v[over] = goals[over], 0.0  # a run that diverged waits at its goal
         dyn = nominal.evaluate(q, v)
         wanted = problem.robot.controller.evaluate(dyn, goals)
-        u, status, short = wanted.u.copy(), np.zeros(len(cases), dtype=np.int64), np.zeros(len(cases))
+        u, status = wanted.u.copy(), np.zeros(len(cases), dtype=np.int64)
         if filters:
             screen = filters[0].screen(dyn, wanted.u, float(now), slips)
-            h, phi = screen.safety.h, screen.rows.phi.min(axis=1)
+            h, phi, short = screen.safety.h, screen.rows.phi.min(axis=1), screen.short.copy()
             for i in map(int, np.flatnonzero(~screen.free & ~over)):
                 result = filters[i].step_screened(_state(dyn, i), screen, i, wanted.u[i], float(wanted.d_p[i]))
                 u[i], status[i], row[i], short[i] = result.u, result.status, result.row, result.short
             if slips is not None:
-                slips.applied(float(now), screen.rows, u, short, status != Status.FAULT)
+                slips.applied(float(now), screen.rows, u, short, (status != Status.FAULT) & np.isfinite(short))
         else:
             h, phi = problem.safety.evaluate(dyn).h, np.full(len(cases), np.nan)
         clearance = h[:, : problem.safety.pairs].min(axis=1)

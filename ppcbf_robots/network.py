@@ -199,10 +199,15 @@ class NumpyNetwork:
         K, K_q, K_v = form(q, v, *self._arguments())
         return np.float64(K), K_q, K_v
 
+    def compiled(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """The convex form's layers and what remains of it at a given q, as ``network_kernel`` takes them."""
+        packed = self._arguments()
+        return packed[:_OF_Q], packed[_OF_Q:]
+
     def of_velocity(self, q: Any) -> tuple[Any, ...]:
         """The convex form at q (nq,) as a function of v alone: the last arguments of ``network_kernel.rise``."""
-        packed = self._arguments()
-        return *network_kernel.convex_units(q, *packed[:_OF_Q]), *packed[_OF_Q:]
+        layers, form = self.compiled()
+        return *network_kernel.convex_units(q, *layers), *form
 
     def _arguments(self) -> tuple[Any, ...]:
         if self._packed is None:

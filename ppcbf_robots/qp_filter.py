@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
 from ppcbf_robots.condense import accept, dimensionless, falling_short, hold_at, inside, near, nearest, pick, power_row
-from ppcbf_robots.cutting_planes import EndOfPeriod
+from ppcbf_robots.cutting_planes import EndOfPeriod, hold_to_the_end
 from ppcbf_robots.filters import Box, Correction, FilterConfig, Status, free_power, slowest_joint
 from ppcbf_robots.qp import QPProblem, QPSolver, make_solver
 from ppcbf_robots.robot import Dynamics
@@ -77,8 +77,9 @@ class QPFilter:
     afterwards and join if they are violated, so the answer satisfies all rows. Where there is no
     solution, the velocity domain is given up first, then passivity; then the least violation is sought.
 
-    Where K_theta is convex in v, a torque that lets K rise further by the end of the control period than its rate says
-    is asked for again with K's tangent there (see :mod:`ppcbf_robots.cutting_planes`), as long as a solution is found.
+    Where K_theta is convex in v, a torque under which K rises further by the end of the control period than its rate
+    says, be it u_des, is asked for again with K's tangent there (see :mod:`ppcbf_robots.cutting_planes`), as long as a
+    solution is found.
 
     Under a limited rate no class-K gain is above the least ``rate / u_max`` of all joints: a row that comes into force
     faster than a torque can be built up finds no solution, and what then follows throws the arm about.
@@ -110,14 +111,24 @@ class QPFilter:
         alpha = min(self.config.alpha, fastest)
         return alpha, min(fast, fastest - alpha), min(fast, fastest), self.config.margin
 
-    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> NDArray[np.bool_]:
-        """Whether :meth:`correct` leaves u_des (B, nv) as it is, (B,), for a batch of states and no limited rate."""
-        hold = np.empty(len(u_des), dtype=np.bool_)
+    def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[NDArray[np.bool_], Array]:
+        """For a batch of states and no limited rate: whether :meth:`correct` leaves u_des (B, nv) as it is, (B,).
+
+        And where it does, ``short`` (B,) of its answer.
+        """
+        hold, short = np.empty(len(u_des), dtype=np.bool_), np.zeros(len(u_des))
+        alpha, release, _, margin = gains = self._gains[False]
         hold_at(
             rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, dyn.Minv, dyn.b, dyn.v, self.safety.v_domain, u_des, u_max,
-            *self._gains[False], _FLAT, ROW_TOLERANCE, hold,
+            *gains, _FLAT, ROW_TOLERANCE, hold,
         )  # fmt: skip
-        return hold
+        if self._convex is not None:
+            layers, form = self._convex.compiled()
+            hold_to_the_end(
+                dyn.q, dyn.v, u_des, dyn.M, dyn.Minv, dyn.b, self.config.dt, self._convex.energy, layers, form,
+                rows.hdot, rows.phi, rows.Lf_phi, rows.Lg_phi, alpha, release, margin, SHORT, hold, short,
+            )  # fmt: skip
+        return hold, short
 
     def _condense(
         self,
@@ -156,22 +167,25 @@ class QPFilter:
         ``allowed`` are the bounds of the torque where they are tighter than u_max, as by its rate.
         """
         qp, hopeless, hold = self._condense(dyn, rows, self._every_row, u_des, u_max, allowed)
-        if hold:
-            return Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
-        answer = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
-        if answer.status is Status.CORRECTING and self._convex is not None:
-            answer = self._with_tangents(EndOfPeriod(self._convex, dyn, self.config.dt), answer, dyn, rows, qp, u_des,
-                                         d_p, u_max, allowed)  # fmt: skip
+        passivity = None if hold else self._passivity_row(dyn, d_p, u_max)
+        answer = (
+            Correction(u_des, Status.FREE, "all rows hold at u_des", -1)
+            if hold
+            else self._ladder(qp, hopeless, passivity, u_des, u_max)
+        )
+        if self._convex is not None:
+            K = EndOfPeriod(self._convex, dyn, self.config.dt)
+            answer = self._to_the_end(K, answer, dyn, rows, qp, u_des, d_p, u_max, allowed)
         return answer if allowed is None else replace(answer, u=np.clip(answer.u, *allowed))
 
-    def _with_tangents(
+    def _to_the_end(
         self, K: EndOfPeriod, answer: Correction, dyn: Dynamics, rows: BarrierRows, qp: QPRows, u_des: Array,
         d_p: float | None, u_max: Array, allowed: Box | None,
     ) -> Correction:  # fmt: skip
-        """The correction for the K that the period ends with, where ``answer`` lets rows of ``qp`` fall short."""
+        """The answer for the K that the period ends with, where ``answer`` lets rows of ``qp`` fall short."""
         alpha, _, _, margin = self._gains[allowed is not None]
         first, tangent = qp, K.tangent(answer.u)
-        for _ in range(CUTS):
+        for _ in range(CUTS if answer.status <= Status.CORRECTING else 0):
             z = (answer.u - u_des) / u_max
             which = falling_short(
                 first.C, first.lower, first.norm, rows.phi, z, tangent.short, alpha, margin, SHORT, _FLAT
@@ -179,39 +193,45 @@ class QPFilter:
             if not len(which):
                 break
             cuts, hopeless, _ = self._condense(dyn, tangent.of(rows, which), which, u_des, u_max, allowed)
-            qp = qp.after(cuts)
-            again = self._ladder(dyn, qp, hopeless, u_des, d_p, u_max)
-            if again.status is not Status.CORRECTING:
+            if hopeless >= 0:
                 break
-            answer, tangent = again, K.tangent(again.u)
+            solved, qp = self._with_or_without_speed(qp.after(cuts), self._passivity_row(dyn, d_p, u_max))
+            if solved is None:
+                break
+            answer = self._answer(solved[0], u_des, u_max, Status.CORRECTING, self._said(qp), solved[1])
+            tangent = K.tangent(answer.u)
         return Correction(answer.u, answer.status, answer.reason, answer.row, tangent.short)
 
-    def _ladder(
-        self, dyn: Dynamics, qp: QPRows, hopeless: int, u_des: Array, d_p: float | None, u_max: Array
-    ) -> Correction:
+    def _ladder(self, qp: QPRows, hopeless: int, passivity: Row | None, u_des: Array, u_max: Array) -> Correction:
         """The QP, and what takes its place where it has no solution."""
         if hopeless >= 0:
             flat = qp.norm[hopeless] < _FLAT
             reason = "L_g phi is zero on a violated row" if flat else f"a row is out of reach of the torque {qp.limits}"
             z = self._least_violation(qp)
             return self._answer(z, u_des, u_max, Status.INFEASIBLE, reason, int(qp.source[hopeless]))
-        passivity = self._passivity_row(dyn, d_p, u_max)
-        solved, reason = self._solve(qp, passivity), "constraint active"
-        if solved is None and len(self.safety.v_domain):  # leaving X is the least evil
-            qp, reason = qp.without_speed(), "constraint active, the velocity domain given up"
-            solved = self._solve(qp, passivity)
+        solved, qp = self._with_or_without_speed(qp, passivity)
         if solved is not None:
-            return self._answer(solved[0], u_des, u_max, Status.CORRECTING, reason, solved[1])
+            return self._answer(solved[0], u_des, u_max, Status.CORRECTING, self._said(qp), solved[1])
         if passivity is not None:
             solved = self._solve(qp, None)
         if solved is not None:
             reason = f"rows and {qp.limits} allow no passive torque"
             return self._answer(solved[0], u_des, u_max, Status.PASSIVITY_DROPPED, reason, solved[1])
         z = self._least_violation(qp)
-        k = int(np.argmax(qp.lower[: qp.barrier_rows]))
-        return self._answer(
-            z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", int(qp.source[k])
-        )
+        k = int(qp.source[np.argmax(qp.lower[: qp.barrier_rows])])
+        return self._answer(z, u_des, u_max, Status.INFEASIBLE, f"no torque in the {qp.limits} satisfies all rows", k)
+
+    def _with_or_without_speed(self, qp: QPRows, passivity: Row | None) -> tuple[Solution | None, QPRows]:
+        """The QP, or where that has no solution, the one that may leave the velocity domain: the least evil."""
+        solved = self._solve(qp, passivity)
+        if solved is None and len(qp.lower) > qp.barrier_rows:
+            qp = qp.without_speed()
+            solved = self._solve(qp, passivity)
+        return solved, qp
+
+    def _said(self, qp: QPRows) -> str:
+        given_up = len(self.safety.v_domain) and len(qp.lower) == qp.barrier_rows
+        return "constraint active, the velocity domain given up" if given_up else "constraint active"
 
     def _passivity_row(self, dyn: Dynamics, d_p: float | None, u_max: Array) -> Row | None:
         """vᵀ δ <= d_p + free_power as (row, lower) of length 1; None where every torque satisfies it."""

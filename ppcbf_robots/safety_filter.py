@@ -47,6 +47,7 @@ class Screen:
     """What is known of a batch of states before any QP is solved."""
 
     free: NDArray[np.bool_]  # (B,) u_des needs no correction
+    short: Array  # (B,) as in StepResult, where it does not
     safety: SafetyRows
     rows: BarrierRows
     wary: BarrierRows  # lowered by the slip of phi, or the same rows
@@ -245,13 +246,13 @@ class SafetyFilter:
             return self._answer(dyn, safety, rows, rows, u_des, d_p, obstacles is not None, allowed)
         wary = self._slip.wary(t, rows)
         result = self._answer(dyn, safety, rows, wary, u_des, d_p, obstacles is not None, allowed)
-        if result.status is not Status.FAULT:
+        if result.status is not Status.FAULT and math.isfinite(result.short):
             self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g, result.short)
         return result
 
     def _usable(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> bool:
         wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
-        return wanted and math.isfinite(rows.Lf_phi.sum() + rows.Lg_phi.sum())
+        return wanted and math.isfinite(rows.phi.sum() + rows.Lf_phi.sum() + rows.Lg_phi.sum())
 
     def _answer(
         self,
@@ -309,8 +310,8 @@ class SafetyFilter:
         rows = self.barrier.rows(dyn, safety)
         wary = rows if slips is None else slips.wary(t, rows)
         total = u_des if self.gravity_included else u_des + dyn.g
-        free = self.correction.passes(dyn, wary, total, self.robot.u_max) & (not self._rate_limited)
-        return Screen(free, safety, rows, wary)
+        free, short = self.correction.passes(dyn, wary, total, self.robot.u_max)
+        return Screen(free & (not self._rate_limited), short, safety, rows, wary)
 
     def step_screened(self, dyn: Dynamics, screen: Screen, i: int, u_des: Array, d_p: float | None) -> StepResult:
         """The step for a valid state ``dyn``, number i of a screened batch, after the last one that this filter saw."""

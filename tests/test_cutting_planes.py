@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from ppcbf_robots import qp_filter
 from ppcbf_robots.cutting_planes import EndOfPeriod
@@ -78,3 +79,28 @@ def test_corrections_keep_the_rows_with_the_K_that_the_period_ends_with(two_link
     without = falls_short(two_link, barrier, config, 600)
     assert len(found) > 20
     assert np.mean(found > 1.1 * tolerated) < 0.1 < 0.2 < np.mean(without > 1.1 * tolerated)
+
+
+def test_a_desired_torque_passes_only_if_the_rows_hold_to_the_end_of_the_period(two_link, make_barrier, monkeypatch):
+    """One state and a batch agree; without the look at the end, some torques pass under which a row falls short."""
+    barrier, config, model = make_barrier(two_link, "pp-ncbf-convex"), FilterConfig(), two_link.model
+    barrier.network.params |= {"cone_a": np.array(0.0), "cone_c": np.array(-8.0)}  # a sharp kink at rest
+    runtime, rng, domain = QPFilter(barrier, two_link.safety, config), np.random.default_rng(3), two_link.robot.domain
+    q, v = model.from_angles(domain.sample_q(rng, 1500)), 0.03 * domain.sample_v(rng, 1500)
+    dyn = model.evaluate_batch(q, v)
+    u_des = dyn.g + rng.uniform(-0.5, 0.5, v.shape) * model.u_max
+    rows = barrier.rows(dyn, two_link.safety.evaluate(dyn))
+    passes, short = runtime.passes(dyn, rows, u_des, model.u_max)
+    wrong = 0
+    for i in np.flatnonzero(rows.h.min(axis=1) > 0.0):
+        one, safety, at = state(two_link, barrier, q[i], v[i])
+        answer = runtime.correct(one, safety, at, u_des[i], None, model.u_max)
+        assert passes[i] == (answer.status is Status.FREE)
+        if passes[i]:
+            assert short[i] == pytest.approx(answer.short, rel=1e-6, abs=1e-9)
+        with monkeypatch.context() as patch:
+            patch.setattr(qp_filter, "CUTS", 0)
+            wrong += (
+                runtime.correct(one, safety, at, u_des[i], None, model.u_max).status is Status.FREE and not passes[i]
+            )
+    assert passes.sum() > 100 and wrong > 5
