@@ -111,7 +111,8 @@ def certificate_line(problem: Problem, name: str, config: FilterConfig) -> str |
     if certificate is None:
         return "none; ppcbf verify makes one"
     goal = problem.model.to_angles(problem.robot.goal)
-    gap = certificate.gap(goal, config.kind, config.metric, config.alpha)
+    limited = bool(np.isfinite(problem.model.u_rate).any())
+    gap = certificate.gap(goal, config.kind, config.metric, config.alpha, config.margin, config.dt, limited)
     return certificate.line() + (f"; {gap}, not for this run" if gap else "")
 
 

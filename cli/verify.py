@@ -25,12 +25,12 @@ from ppcbf_robots.results_file import Record
 from ppcbf_robots.sweep import run_sweep
 
 Method = Literal["auto", "proof", "samples"]
-COUNTEREXAMPLES = "counterexamples.npz"
 RECORDS = "verify.jsonl"  # of unfinished samples, in the barrier's folder
 MODEL = "errors of the model: masses, friction, delays, noise"
 MASSES = (
-    "other masses and inertias than those, centres of mass, friction, delays, noise; that the filter, which knows the "
-    "model alone, finds the torque that serves all of them"
+    "other errors of the model: mass and inertia of a link by different factors, centres of mass, friction, delays, "
+    "noise; that the filter, which knows the model alone, finds the torque that serves all robots; what the energy of "
+    "those does, whose gravity the controller does not know"
 )
 NEVER = [
     "states outside X, below phi = 0, or above the band",
@@ -56,7 +56,7 @@ def verify(
             min=0.0,
             max=30.0,
             metavar="PERCENT",
-            help="One torque for all robots whose links differ by so much in mass and inertia; proof.",
+            help="One torque for all robots whose links weigh up to so much more or less; proof.",
         ),
     ] = 0.0,
     samples: Annotated[int, typer.Option(min=1, help="Independent states of the band.")] = 69_075,
@@ -73,8 +73,8 @@ def verify(
 
     For one or two joints: a proof by branch and bound on the whole band. For more: independent samples with a
     confidence bound, and a gradient attack. States that break a condition go to DIR/counterexamples.npz, which
-    `ppcbf train --counterexamples` reads. Exits with 3 unless everything was proved or bounded. The same command goes
-    on after Ctrl-C or the time limit.
+    `ppcbf train --counterexamples` reads; with --mass-error both names end in _mass_PERCENT. Exits with 3 unless
+    everything was proved or bounded. The same command goes on after Ctrl-C or the time limit.
 
     Example: ppcbf verify runs/two_link
     """
@@ -98,11 +98,12 @@ def verify(
         found = _prove(problem, stored, folder, power, mass_error / 100.0, jobs, time_limit)
     judged, states, details = found
     certificate = Certificate(
-        overall(judged), judged, subject(stored.data, stored.filter_config().margin), _not_covered(mass_error),
+        overall(judged), judged, _subject(stored), _not_covered(mass_error),
         round(time.monotonic() - began, 2), "samples" if reason else "proof", details,
     )  # fmt: skip
-    path = save_certificate(folder, certificate)
-    files = [str(path), *_save_states(problem, folder, states)]
+    ending = _suffix(mass_error / 100.0)
+    path = save_certificate(folder, certificate, f"certificate{ending}.json")
+    files = [str(path), *_save_states(problem, folder / f"counterexamples{ending}.npz", states)]
     if json:
         emit_json(certificate.report() | {"files": files})
     else:
@@ -128,6 +129,20 @@ def _no_proof(problem: Problem, stored: StoredBarrier) -> str:
     return obstacle_to_proof(problem, stored) or check_symbolic(problem)
 
 
+def _subject(stored: StoredBarrier) -> dict[str, Any]:
+    config = stored.filter_config()
+    return subject(stored.data, config.margin, config.dt)
+
+
+def _suffix(mass_error: float) -> str:
+    """Files of a proof for other masses stand beside those of the model's."""
+    if mass_error == 0.0:
+        return ""
+    from ppcbf_robots.proof.prove import suffix
+
+    return suffix(mass_error)
+
+
 def _not_covered(mass_error: float) -> list[str]:
     return [MASSES if mass_error > 0.0 and x is MODEL else x for x in NEVER]
 
@@ -151,7 +166,7 @@ def _prove(
     search = proof.search
     states = [("feasibility", [x.tolist() for x in search.infeasible])]
     states.append(("passivity", [x.tolist() for x in search.impassive]))
-    details = proof.details | {"power": power, "mass_error": mass_error, "complete": proof.complete}
+    details = proof.details | {"power": power, "complete": proof.complete}
     return proof.conditions, states, details
 
 
@@ -196,9 +211,8 @@ def _bar(what: str) -> Iterator[Callable[[float, str], None]]:
         raise
 
 
-def _save_states(problem: Problem, folder: Path, states: list[tuple[str, list[list[float]]]]) -> list[str]:
+def _save_states(problem: Problem, path: Path, states: list[tuple[str, list[list[float]]]]) -> list[str]:
     """Write states that break a condition: q (n, nq) in Pinocchio's coordinates, v (n, nv), condition (n,)."""
-    path = folder / COUNTEREXAMPLES
     x = np.array([s for _, found in states for s in found])
     if not len(x):
         path.unlink(missing_ok=True)
@@ -218,7 +232,7 @@ def _print(certificate: Certificate, files: list[str]) -> None:
     table(title, ["condition", "verdict", "bound", "states that break it"], rows)
     for name, c in certificate.conditions.items():
         out.print(f"{name}: {c.statement}")
-    passivity, excess = certificate.conditions.get("passivity"), certificate.details.get("largest_excess_power", 0.0)
+    passivity, excess = certificate.conditions.get("passivity"), certificate.details.get("largest_excess_power") or 0.0
     if passivity is not None and passivity.verdict == "refuted" and excess > 0.0:
         separate = certificate.details["separating"]
         out.print(

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 from ppcbf_robots.errors import InputError
 
 NAME = "certificate.json"
-FORMAT = 1
+FORMAT = 2
 GOAL_TOLERANCE = 1e-9  # [rad | m]
 CERTIFIED = ("proved", "bounded")
 
@@ -61,11 +61,18 @@ class Certificate:
         masses = self.details.get("mass_error", 0.0)
         return f"{self.verdict} ({parts}{f'; masses within {masses:.3g} of the model' if masses else ''})"
 
-    def gap(self, goal: Sequence[float], filter_kind: str, metric: str, alpha: float) -> str:
+    def gap(
+        self, goal: Sequence[float], filter_kind: str, metric: str, alpha: float, margin: float, dt: float,
+        rate_limited: bool,
+    ) -> str:  # fmt: skip
         """Why it does not speak about a filter and a goal (one number per joint), as a clause; "" if it does."""
         known = self.subject["filter"]
         if (filter_kind, metric, alpha) != (known["kind"], known["metric"], known["alpha"]):
             return f"for the {known['kind']} filter in the {known['metric']} metric with alpha = {known['alpha']:g}"
+        if (margin, dt) != (self.subject["margin"], self.subject["dt"]):
+            return f"for a control period of {self.subject['dt']:g} s and a margin of {self.subject['margin']:g}"
+        if rate_limited:
+            return "for torques whose rate is not limited"
         if any(abs(a - b) > GOAL_TOLERANCE for a, b in zip(goal, self.subject["goal"], strict=True)):
             return "passivity for another goal"
         return ""
@@ -81,15 +88,15 @@ def overall(conditions: Mapping[str, Condition]) -> Verdict:
     return min((c.verdict for c in conditions.values()), key=order.index)
 
 
-def subject(barrier: Mapping[str, Any], margin: float) -> dict[str, Any]:
-    """What a certificate is about, from the contents of ``barrier.json`` and the margin of the filter."""
+def subject(barrier: Mapping[str, Any], margin: float, dt: float) -> dict[str, Any]:
+    """What a certificate is about, from the contents of ``barrier.json``, and the filter's margin and period."""
     keys = ("kind", "network", "formula", "filter", "fingerprint", "weights_sha256", "goal")
-    return {key: barrier.get(key) for key in keys} | {"margin": margin}
+    return {key: barrier.get(key) for key in keys} | {"margin": margin, "dt": dt}
 
 
-def save_certificate(folder: Path, certificate: Certificate) -> Path:
+def save_certificate(folder: Path, certificate: Certificate, name: str = NAME) -> Path:
     """Write it beside the barrier by an atomic rename."""
-    path, temporary = folder / NAME, folder / f".{NAME}.tmp"
+    path, temporary = folder / name, folder / f".{name}.tmp"
     try:
         temporary.write_text(json.dumps(certificate.report(), indent=1, allow_nan=False), encoding="utf-8")
         temporary.replace(path)
@@ -116,6 +123,6 @@ def load_certificate(folder: Path, barrier: Mapping[str, Any]) -> Certificate | 
         assert found.verdict == overall(found.conditions)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, AssertionError):
         raise InputError(f"{path}: not a certificate of this version; run `ppcbf verify {folder}` again") from None
-    if found.subject != subject(barrier, found.subject.get("margin", 0.0)):
+    if found.subject != subject(barrier, *(found.subject.get(k, 0.0) for k in ("margin", "dt"))):
         raise InputError(f"{path}: belongs to another barrier (its hashes differ); run `ppcbf verify {folder}` again")
     return found

@@ -45,7 +45,9 @@ def trained(tmp_path, random_network) -> Path:
 
 def certify(folder: Path, **conditions: Condition) -> None:
     data = load_barrier(folder).data
-    found = Certificate(overall(conditions), conditions, subject(data, 1e-3), ["errors of the model"], 12.0, "samples")
+    found = Certificate(
+        overall(conditions), conditions, subject(data, 1e-3, 1e-3), ["errors of the model"], 12.0, "samples"
+    )
     save_certificate(folder, found)
 
 

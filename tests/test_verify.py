@@ -219,3 +219,17 @@ def test_a_proof_that_cannot_be_is_refused_or_replaced(folder, tmp_path):
     save_barrier(tmp_path / "b", problem, "pp-ncbf", "convex", no_network(problem), FilterConfig(), {})
     done = run_cli("verify", tmp_path / "b", "--method", "proof")
     assert done.code == 2 and "'table' is neither" in " ".join(done.stderr.split())
+
+
+def test_a_proof_for_other_masses_stands_beside_that_of_the_model(folder, tmp_path):
+    copied = tmp_path / "barrier"
+    shutil.copytree(folder, copied)
+    before = {p.name: p.read_bytes() for p in copied.iterdir()}
+    found = facts("verify", copied, "--mass-error", 2.5, "--time-limit", 1, "--jobs", 1, code=3)
+    assert found["details"]["mass_error"] == 0.025 and found["details"]["largest_excess_power"] is None
+    assert "up to 2.5 %" in found["conditions"]["feasibility"]["statement"]
+    assert any("different factors" in x for x in found["not_covered"])
+    assert found["files"][0].endswith("certificate_mass_2.5.json")
+    assert all((copied / name).read_bytes() == content for name, content in before.items())
+    refused = run_cli("verify", copied, "--mass-error", 2.5, "--method", "samples")
+    assert refused.code == 2 and "--mass-error is for proofs" in refused.stderr

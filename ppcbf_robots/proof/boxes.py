@@ -43,8 +43,8 @@ class BoxJudge:
         network: convex form of K_theta.
         config: the QP filter.
         power: [W] that the passivity row is given beyond what the filter allows itself.
-        mass_error: largest share by which each link's mass and inertia may differ from the model's. The one torque that
-            a box needs then serves all of them; they are symbols of the forms that are never cut.
+        mass_error: largest share by which each link may be heavier or lighter than the model's, mass and inertia by the
+            same factor. The one torque that a box needs then serves all; they are symbols that are never cut.
 
     Raises:
         InputError: for obstacles that have no symbolic form.

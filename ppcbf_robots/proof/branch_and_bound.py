@@ -55,9 +55,14 @@ class Search:
         return float(np.mean(self.home < 0)) if len(self.home) else 0.0
 
     @property
+    def complete(self) -> bool:
+        """Whether every box was decided or given up."""
+        return len(self.boxes) == 0
+
+    @property
     def done(self) -> bool:
-        """Whether the search has nothing left to do."""
-        return len(self.boxes) == 0 or len(self.infeasible) >= ENOUGH
+        """Whether the search goes no further: it is complete, or knows enough counterexamples."""
+        return self.complete or len(self.infeasible) >= ENOUGH
 
 
 def begin(judge: BoxJudge, passive: bool, markers: Array) -> Search:

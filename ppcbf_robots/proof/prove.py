@@ -27,7 +27,6 @@ from ppcbf_robots.proof.witness import JOINTS, best_torque
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array
 
-STATE = "verify.npz"  # of an unfinished proof, in the barrier's folder
 VERSION = 1  # of what a state file holds
 MARKERS = 4_000  # band states that show how far the proof is
 RAY_STATES = 10_000  # at which v · ∂K/∂v >= K is looked at
@@ -43,6 +42,7 @@ class Proof:
     band: float  # volume of the band relative to X, from samples
     separating: float  # share of the states that lack passivity, in which the row of least phi has ḣ > 0
     rows: list[str]  # names of the rows that the proof is about
+    mass_error: float
 
     @property
     def details(self) -> dict[str, Any]:
@@ -55,10 +55,21 @@ class Proof:
             "volume_without_passivity": s.impassive_volume,
             "volume_undecided": s.undecided_volume,
             "band_volume": self.band,
-            "largest_excess_power": s.excess,
+            "largest_excess_power": s.excess if self.mass_error == 0.0 else None,  # looked at for the model alone
+            "mass_error": self.mass_error,
             "separating": self.separating,
             "rows": self.rows,
         }
+
+
+def state_name(mass_error: float = 0.0) -> str:
+    """Name of the file that holds an unfinished proof, in the barrier's folder."""
+    return f"verify{suffix(mass_error)}.npz"
+
+
+def suffix(mass_error: float) -> str:
+    """What the files of a proof for other masses have behind their names."""
+    return f"_mass_{100.0 * mass_error:g}" if mass_error > 0.0 else ""
 
 
 def obstacle_to_proof(problem: Problem, stored: StoredBarrier) -> str:
@@ -94,7 +105,7 @@ def prove(
         threads: boxes are judged by so many at once.
         seconds: after which to stop.
         on_round: called after every round of boxes.
-        mass_error: largest share by which each link's mass and inertia may differ from the model's.
+        mass_error: largest share by which each link may be heavier or lighter, mass and inertia by the same factor.
 
     Raises:
         InputError: for obstacles that have no symbolic form.
@@ -106,7 +117,7 @@ def prove(
     q, v, tried = uniform_band(problem, barrier, MARKERS, np.random.default_rng(0))
     if not len(q):
         raise CheckFailed(f"none of {tried:,} uniform states of X lies on the band: the safe set has collapsed")
-    path, identity = folder / STATE, _identity(problem, stored, config, power, mass_error)
+    path, identity = folder / state_name(mass_error), _identity(problem, stored, config, power, mass_error)
     search = load_search(path, identity)
     if search is None:
         markers = np.concatenate([problem.model.to_angles(q), v], axis=1)
@@ -123,9 +134,8 @@ def prove(
     leaving = sum(_separates(problem, barrier, x) for x in search.impassive)
     separating = leaving / max(1, len(search.impassive))
     rows = problem.safety.names[: problem.safety.rows]
-    return Proof(
-        search, _conditions(problem, stored, search, power, band, mass_error), search.done, band, separating, rows
-    )
+    conditions = _conditions(problem, stored, search, power, band, mass_error)
+    return Proof(search, conditions, search.complete, band, separating, rows, mass_error)
 
 
 def _separates(problem: Problem, barrier: Barrier, x: Array) -> bool:
@@ -216,29 +226,32 @@ def _conditions(
     epsilon, rows = stored.spec.epsilon, problem.safety.rows
     on_band = f"on the whole band {{0 <= min_k phi_k <= {epsilon:g}, h >= 0}} in X"
     if mass_error > 0.0:
-        percent = f"{100.0 * mass_error:g} %"
-        on_band += f", for all robots at once whose links' masses and inertias differ by {percent} at most"
+        on_band += (
+            f", for all robots at once whose links are each heavier or lighter by up to {100.0 * mass_error:g} %, "
+            "mass and inertia by the same factor"
+        )
     failed = len(search.infeasible)
-    verdict = _verdict(failed, search.done and search.undecided_volume == 0.0)
-    share = search.undecided_volume / band
+    verdict = _verdict(failed, search.complete and search.undecided_volume == 0.0)
+    left = search.undecided_volume + _volume(problem, search.boxes)
+    share = left / band
     conditions = {
         "feasibility": Condition(
             verdict,
             f"a torque within the limits satisfies psi_k(u) >= -alpha (phi_k - margin) - fast_alpha max(0, min(hdot_k, "
             f"phi_k)) for all {rows} rows {on_band}",
-            bound=min(1.0, share) if search.done else 1.0,
+            bound=min(1.0, share),
             violations=failed,
         )
     }
     if stored.kind == "pp-ncbf":
         failed = len(search.impassive)
-        complete = search.done and search.impassive_volume == search.undecided_volume == 0.0
-        share = (search.impassive_volume + search.undecided_volume) / band
+        complete = search.complete and search.impassive_volume == search.undecided_volume == 0.0
+        share = (search.impassive_volume + left) / band
         beyond = free_power(problem.model) + power
         conditions["passivity"] = Condition(
             _verdict(failed, complete),
             f"such a torque also satisfies v·(u - u_des) <= d_p + {beyond:.3g} W {on_band}",
-            bound=min(1.0, share) if search.done else 1.0,
+            bound=min(1.0, share),
             violations=failed,
         )
         if stored.filter["metric"] == "kinetic":
@@ -250,6 +263,13 @@ def _conditions(
         bound=search.Lg if known else None,
     )
     return conditions
+
+
+def _volume(problem: Problem, boxes: Array) -> float:
+    """Volume of boxes (n, 2, 2 nv), relative to X."""
+    domain = problem.robot.domain
+    width = np.concatenate([np.ptp(domain.q, axis=1), np.ptp(domain.v, axis=1)])
+    return float((np.ptp(boxes, axis=1) / width).prod(axis=-1).sum())
 
 
 def _verdict(counterexamples: int, complete: bool) -> Verdict:
