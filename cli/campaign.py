@@ -19,11 +19,13 @@ from ppcbf_robots.campaign import Drawing, draw, outcome, run_cases, total
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, alarms_expected, emit_json, out, table
 from ppcbf_robots.cli.simulate import (
     BarrierOption,
+    EffortRateOption,
     EngineOption,
     FilterOption,
     MetricOption,
     choose_barrier,
     described,
+    limit_rate,
     mujoco_engine,
 )
 from ppcbf_robots.cli.tasks import DaskOption, run_tasks
@@ -50,12 +52,13 @@ class Chunk:
     filter: FilterKind | None
     metric: Metric | None
     engine: EngineName
+    effort_rate: float | None
     drawing: Drawing
     numbers: range
 
     def load(self) -> tuple[Problem, Barrier | None, FilterConfig]:
         """What the runs are about; kept for the next chunk of the same process."""
-        return _load(self.robot, self.world, self.barrier, self.filter, self.metric)
+        return _load(self.robot, self.world, self.barrier, self.filter, self.metric, self.effort_rate)
 
     def trajectories(self) -> Iterator[tuple[Any, Trajectory]]:
         """Every case with its run."""
@@ -89,6 +92,7 @@ class Chunk:
             "world": self.world,
             "barrier": self.barrier,
             "engine": self.engine,
+            "effort_rate": self.effort_rate,
             **dataclasses.asdict(self.drawing),
             "first": self.numbers.start,
             "count": len(self.numbers),
@@ -99,9 +103,9 @@ class Chunk:
 
 @functools.lru_cache(maxsize=1)
 def _load(
-    robot: str, world: str, barrier: str, kind: FilterKind | None, metric: Metric | None
+    robot: str, world: str, barrier: str, kind: FilterKind | None, metric: Metric | None, effort_rate: float | None
 ) -> tuple[Problem, Barrier | None, FilterConfig]:
-    problem = load_problem(robot, world)
+    problem = limit_rate(load_problem(robot, world), effort_rate)
     return problem, *choose_barrier(problem, barrier, kind, metric)
 
 
@@ -121,6 +125,7 @@ def campaign(
         float,
         typer.Option(min=0.0, max=90.0, metavar="PERCENT", help="Links heavier or lighter than the filter's model."),
     ] = 0.0,
+    effort_rate: EffortRateOption = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes at once on this machine, one core each.")] = 1,
     dask: DaskOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of starts, goals, pushes and masses.")] = 0,
@@ -144,7 +149,9 @@ def campaign(
     if Path(barrier).is_dir():
         barrier = str(Path(barrier).resolve())
     drawing = Drawing(seed, duration, pushes, mass_error / 100.0)
-    whole = Chunk(portable(robot), portable(obstacles), barrier, filter, metric, engine, drawing, range(rollouts))
+    whole = Chunk(
+        portable(robot), portable(obstacles), barrier, filter, metric, engine, effort_rate, drawing, range(rollouts)
+    )
     problem, chosen, _ = whole.load()
     draw(problem, chosen, drawing, 0)  # what cannot be drawn is said at once
     if engine == "mujoco":
@@ -176,6 +183,7 @@ def _facts(whole: Chunk, records: Sequence[Record]) -> dict[str, Any]:
         outcomes.update(enumerate(record["result"]["outcomes"], start=record["key"]["first"]))
     problem, barrier, config = whole.load()
     made = {**described(problem, barrier, config), "barrier": whole.barrier, "engine": whole.engine}
+    made["effort_rate"] = whole.effort_rate
     seconds = round(sum(record["result"]["seconds"] for record in records), 1)
     return {**made, **dataclasses.asdict(whole.drawing), **total(outcomes), "seconds": seconds}
 
@@ -226,6 +234,7 @@ def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
         ["least h", f"{facts['min_h']:.6f} (run {worst['min_h']}; median of the runs {facts['median_min_h']:.4f})"],
         ["least clearance [m]", f"{facts['min_clearance']:.6f}"],
         ["most energy above V0 and pushes [J]", f"{facts['max_energy_rise']:.3g}"],
+        ["the same as a share of V0", f"{facts['max_energy_share']:.2g}"],
         ["most energy injected [J]", f"{facts['max_injected']:.3g} {injected}"],
         ["steps without a solution", str(facts["qp_failures"])],
         ["steps below the full QP", str(facts["fallbacks"])],

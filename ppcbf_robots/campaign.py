@@ -30,6 +30,7 @@ SPEEDS = 10  # velocities tried per start configuration
 MAX_PUSHES = 3
 PUSH_SPEED = 0.1  # of v_max, by which a push changes the speed of each joint at most, at the start configuration
 PUSH_SECONDS = (0.05, 0.2)
+ENERGY_FLOOR = 1e-3  # [J] of V0, below which shares of it say nothing
 TORQUE_TOLERANCE = 1e-9  # of u_max
 LIMIT_TOLERANCE = 1e-4  # [rad | m] beyond a joint limit: less is what a held torque slips within a control period
 RATE_TOLERANCE = 1e-6  # of the largest step
@@ -141,7 +142,8 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     ``contact`` (where the engine knows contacts, of the links themselves; else a clearance below 0), ``beyond_limit``
     (a joint more than 0.1 mrad or mm beyond its limit), ``torque`` (largest |u_i| / u_max,i), ``rate`` (largest change
     of torque over its limit, 0 without limits), ``energy_rise`` [J] (the most by which V exceeds V0 and the pushes'
-    work so far), ``injected`` [J] (its largest rise over its running minimum, less that work), ``push_work`` [J],
+    work so far), ``energy_share`` (that, of V0), ``injected`` [J] (its largest rise over its running minimum, less that
+    work), ``push_work`` [J],
     ``qp_failures`` (steps in which no torque satisfies all rows, or the solver gave none), ``fallbacks`` (steps below
     the QP with all its rows), ``state`` (how the run ended, or ``diverged``), ``goal_error``.
     """
@@ -149,6 +151,7 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     known = np.isfinite(run.h) & np.isfinite(run.V) & np.isfinite(run.u).all(axis=1)  # not all of a run that diverges
     work = _push_work(problem.model, case, run)[known]
     unexplained = run.V[known] - work
+    rise = float(np.max(unexplained) - unexplained[0])
     h, pairs = run.h[known], run.clearance[known]
     clearance = float(pairs.min())
     steps = {status: int(np.sum(run.status == status)) for status in Status}
@@ -161,7 +164,8 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
         "beyond_limit": bool(beyond.any()),
         "torque": float(np.max(np.abs(run.u[known]) / problem.model.u_max)),
         "rate": _rate(problem.model, run.u[known], float(run.t[-1]) / max(1, len(run.t) - 1)),
-        "energy_rise": float(np.max(unexplained) - unexplained[0]),
+        "energy_rise": rise,
+        "energy_share": rise / max(float(unexplained[0]), ENERGY_FLOOR),
         "injected": float(np.max(unexplained - np.minimum.accumulate(unexplained))),
         "push_work": float(work[-1]),
         "qp_failures": failures,
@@ -209,6 +213,7 @@ def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
         "qp_failures": sum(values("qp_failures")),
         "fallbacks": sum(values("fallbacks")),
         "max_energy_rise": max(values("energy_rise")),
+        "max_energy_share": max(values("energy_share")),
         "max_injected": max(values("injected")),
         "median_injected": float(np.median(values("injected"))),
         "min_h": min(values("min_h")),

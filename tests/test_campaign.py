@@ -263,6 +263,19 @@ def test_campaign_in_mujoco_with_pushes_and_wrong_masses(tmp_path: Path, monkeyp
     assert worst.meta["contacts"] is not None and worst.meta["pushes"]
 
 
+def test_campaign_limits_the_torques_rate(tmp_path: Path, monkeypatch, capsys):
+    """Limited, no run breaks it; what the same torques would have broken shows that it matters."""
+    options = ("--duration", 0.5, "--rollouts", 3, "--json")
+    assert run("two_link", "circle", *options, "--effort-rate", 500, "--out", tmp_path, monkeypatch=monkeypatch) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["effort_rate"] == 500.0 and facts["rate_violations"] == 0
+    assert 0.0 <= facts["max_energy_share"] < 1e-3
+    worst = Trajectory.load(tmp_path / "worst.npz")
+    assert np.max(np.abs(np.diff(worst.u, axis=0))) <= 0.5 * (1.0 + 1e-9)
+    assert np.max(np.abs(np.diff(worst.u, axis=0))) > 0.01
+    assert run("two_link", "circle", *options, "--effort-rate", -1, "--out", tmp_path, monkeypatch=monkeypatch) == 2
+
+
 @pytest.mark.parametrize(
     "arguments, said",
     [
