@@ -47,7 +47,8 @@ class MarginDescent(Descent):
         super().__init__(problem, kind, preset, seed, device)
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._joints = problem.model.nv
-        self.margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
+        self._largest_margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
+        self.margin = max(MIN_MARGIN, preset.first_margin * self._largest_margin)
         self._hunt = self.falsifier.start()  # goes on from check to check
         self._first_pool = len(self.rays)
         self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
@@ -196,10 +197,17 @@ class MarginDescent(Descent):
         self._join(self.rays_through(q, v))
 
     def demand_more(self) -> None:
-        """Volume weighs less, and what depends on q more."""
+        """Larger margins and a larger share of the kinetic energy; volume weighs less, and what depends on q more."""
         self._max_weight *= HUMBLER
         self._simplicity *= SIMPLER
         self._weight = self._weight.clamp(max=self._max_weight)
+        self.margin = min(self._largest_margin, 2.0 * self.margin)
+        if "energy_a" in self.params:  # what is still found then is mostly a stretched arm at full speed
+            energy = torch.nn.functional.softplus(self.judged["energy_a"])
+            lifted = torch.log(torch.expm1((2.0 * energy).clamp(min=self.preset.energy_lift)))
+            with torch.no_grad():
+                self.params["energy_a"].copy_(lifted)
+                self.judged["energy_a"].copy_(lifted)
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
         """Rays that joined and the margins noted; weights."""
@@ -208,7 +216,7 @@ class MarginDescent(Descent):
         tensors |= {f"judged/{k}": self.judged[k] for k in self.trained}
         tensors |= {f"hunt/{k}": torch.as_tensor(x) for k, x in vars(self._hunt).items()}
         tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
-        return tensors, {"max_weight": self._max_weight, "simplicity": self._simplicity}
+        return tensors, {"max_weight": self._max_weight, "simplicity": self._simplicity, "margin": self.margin}
 
     def restore(self, tensors: Tensors, numbers: dict[str, Any]) -> None:
         """See :meth:`state`."""
@@ -223,4 +231,4 @@ class MarginDescent(Descent):
         self._noted, self._weight, self._crossing, self._near = (
             tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")
         )
-        self._max_weight, self._simplicity = numbers["max_weight"], numbers["simplicity"]
+        self._max_weight, self._simplicity, self.margin = (numbers[k] for k in ("max_weight", "simplicity", "margin"))

@@ -10,6 +10,9 @@ from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.problem import Problem
 
 Tensors = dict[str, torch.Tensor]
+# Training begins next to the LB-CBF, whose set is the largest, and K grows where margins ask for it.
+CONE, BOWL = 0.005, 0.002  # [m/s], first a of the speed terms
+UNIT = -6.5  # first a of the units, before its softplus
 CONSTANTS = ("in_shift", "in_scale", "turns", "v_scale", "energy_scale", "zero_at_rest")  # not trained
 
 
@@ -39,14 +42,14 @@ def initial_parameters(problem: Problem, preset: Preset, energy: float, generato
     nv, units = problem.model.nv, preset.units
     p["v_scale"] = 1.0 / v_max
     mean_square = nv / 3.0  # of |v / v_max| over X
-    for form, a, b, c in (("cone", 0.15, 1.0, 0.05), ("bowl", 0.06, math.sqrt(5.0 / mean_square), 5.0)):
+    for form, a, b, c in (("cone", CONE, 1.0, 0.05), ("bowl", BOWL, math.sqrt(5.0 / mean_square), 5.0)):
         c = c if form == "bowl" else math.log(math.expm1(c))
         p[f"{form}_a"], p[f"{form}_c"] = (torch.tensor(x, dtype=torch.float64) for x in (math.log(math.expm1(a)), c))
         p[f"{form}_b"] = torch.full((nv,), b, dtype=torch.float64)
     if nv > preset.covered_joints:
         p["energy_a"] = torch.tensor(math.log(math.expm1(preset.energy)), dtype=torch.float64)
         p["energy_scale"] = torch.tensor(1.0 / energy, dtype=torch.float64)
-    p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -3.0, dtype=torch.float64)
+    p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), UNIT, dtype=torch.float64)
     p["Wc"], p["bc"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -1.0, dtype=torch.float64)
     p["Wb"], _ = _linear(width, units * nv, generator)
     p["bb"] = torch.randn(units * nv, generator=generator, dtype=torch.float64) * 2.0
