@@ -43,7 +43,7 @@ from ppcbf_robots.safety_filter import SafetyFilter
 pytestmark = pytest.mark.usefixtures("one_thread")
 TINY = dataclasses.replace(
     DEFAULT, rays=500, samples=100, top=20, hidden=(16, 16), units=4, iterations=8, check_every=2, test_samples=200,
-    refinements=1, search_rounds=1, attack_rounds=2, refinement_share=0.5,
+    refinements=1, search_rounds=1, attack_rounds=2, refinement_share=0.5, judge_first=False,
 )  # fmt: skip
 TINY_PAPER = dataclasses.replace(TINY, network="mlp", filter="closed-form", metric="torque", l2=1e-2)
 
@@ -71,7 +71,9 @@ def assert_same_weights(a: dict[str, Any], b: dict[str, Any]) -> None:
 
 
 def without_times(history: list[Monitor]) -> list[Monitor]:
-    return [dataclasses.replace(m, seconds=0.0) for m in history]
+    return [
+        dataclasses.replace(m, seconds=0.0, loss=np.nan_to_num(m.loss)) for m in history
+    ]  # no loss before the first step
 
 
 @pytest.mark.parametrize("preset", [TINY, TINY_PAPER], ids=["default", "paper"])
@@ -570,3 +572,23 @@ def test_check_band_finds_energy_that_enters(cartpole):
     )
     assert passive.samples == free.samples == 300
     assert passive.violations > free.violations
+
+
+def test_a_robot_that_needs_no_learned_term_is_done_at_once(two_link, cartpole, monkeypatch):
+    """Torque is ample for the two-link: what training begins with stands. The cart-pole's LB set does not."""
+    checked: list[int] = []
+    _, result = train(two_link, PRESETS["default"], on_check=lambda m: checked.append(m.iteration))
+    assert result.converged and result.steps == 0 and checked == [0]
+    assert result.volume_kept > 0.99 and result.attack.worst > RESERVE and result.check.violations == 0
+
+    joined: list[int] = []
+    join = MarginDescent.add_counterexamples
+    monkeypatch.setattr(
+        MarginDescent, "add_counterexamples", lambda self, q, v: (joined.append(self.iteration), join(self, q, v))[1]
+    )
+    preset = dataclasses.replace(TINY, judge_first=True, refinements=0)
+    trainer, result = train(cartpole, preset)
+    assert result.steps == TINY.iterations and joined[0] == 0
+    assert (
+        trainer.descent.margin == Trainer(cartpole, "pp-ncbf", preset).descent.margin
+    )  # nothing more is asked for yet

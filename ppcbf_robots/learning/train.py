@@ -146,13 +146,18 @@ class Trainer:
     ) -> Result:
         """Train until the planned iterations are done and the evidence is clean, or time is up.
 
+        The barrier that training begins with is judged first where the preset says so: it may need none.
         KeyboardInterrupt ends training and judges the best barrier so far.
         """
         interrupted = False
         tested: list[Tested] = []
-        for round_ in range(self.preset.refinements + 1):
+        at_once = self.preset.judge_first and self.descent.iteration == 0
+        for round_ in range(-1 if at_once else 0, self.preset.refinements + 1):
             try:
-                self._descend(on_check, time_limit)
+                if round_ < 0:
+                    self._look(on_check)
+                else:
+                    self._descend(on_check, time_limit)
             except KeyboardInterrupt:
                 interrupted = True
             try:
@@ -164,6 +169,9 @@ class Trainer:
             enough = bool(tested) and (tested[0].clean or (round_ >= RESERVE_ROUNDS and tested[0].stands))
             if enough or interrupted or out_of_time or round_ == self.preset.refinements:
                 break
+            if round_ < 0:
+                self._join(found)
+                continue
             self._refine(found)
             if on_refine is not None:
                 on_refine(f"{_said(found[-1]) if found else 'no clean barrier'}: refining")
@@ -176,11 +184,14 @@ class Trainer:
         while descent.iteration < descent.planned and time.monotonic() - self.started < time_limit:
             descent.iterate()
             if descent.iteration % self.preset.check_every == 0 or descent.iteration == descent.planned:
-                monitor = self._check()
-                if on_check is not None:
-                    on_check(monitor)
+                self._look(on_check)
                 if self._settled():
                     break
+
+    def _look(self, on_check: Callable[[Monitor], None] | None) -> None:
+        monitor = self._check()
+        if on_check is not None:
+            on_check(monitor)
 
     def _check(self) -> Monitor:
         """Fresh band states without the training margin, volume and start state."""
@@ -237,15 +248,19 @@ class Trainer:
 
     def _refine(self, tested: list[Tested]) -> None:
         """The states found join, and training goes on for a while; where some violate, the descent asks for more."""
+        self._join(tested)
+        if not tested or any(t.violates for t in tested):
+            self.descent.demand_more()
+        self.descent.planned = self.descent.iteration + int(self.preset.refinement_share * self.preset.iterations)
+
+    def _join(self, tested: list[Tested]) -> None:
+        """The states found join what is trained on; candidates so far are done with."""
         self.clean = []
         states = [(t.check.bad_q, t.check.bad_v) for t in tested if t.check.violations]
         states += [(t.attack.q, t.attack.v) for t in tested if t.attack is not None]
         if states:
             q, v = (np.concatenate(x) for x in zip(*states, strict=True))
             self.descent.add_counterexamples(q, v)
-        if not tested or any(t.violates for t in tested):
-            self.descent.demand_more()
-        self.descent.planned = self.descent.iteration + int(self.preset.refinement_share * self.preset.iterations)
 
     def _result(self, best: Tested, interrupted: bool) -> Result:
         check, descent = best.check, self.descent
