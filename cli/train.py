@@ -206,6 +206,8 @@ def _print(report: dict[str, Any]) -> None:
         f"volume kept {report['volume_kept']:.1%} of the LB safe set; "
         f"{report['violations']} violations in {report['samples']} uniform band states"
     )
+    if report["converged"] and report["steps"] == 0:
+        out.print("no learned term is needed here: K_theta = 0, the set is that of the LB-CBF")
     if report["worst_margin"] is not None:
         what = "no state" if report["worst_margin"] >= 0.0 else "states"
         out.print(

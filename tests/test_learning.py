@@ -33,6 +33,7 @@ from ppcbf_robots.learning.margin_descent import (
     MarginDescent,
 )
 from ppcbf_robots.learning.paper_descent import PaperDescent
+from ppcbf_robots.learning.parameters import without_term
 from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS, Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.learning.train import CANDIDATES, MIN_SAMPLES, Monitor, Result, Trainer, settings, with_gamma
@@ -575,11 +576,13 @@ def test_check_band_finds_energy_that_enters(cartpole):
 
 
 def test_a_robot_that_needs_no_learned_term_is_done_at_once(two_link, cartpole, monkeypatch):
-    """Torque is ample for the two-link: what training begins with stands. The cart-pole's LB set does not."""
-    checked: list[int] = []
-    _, result = train(two_link, PRESETS["default"], on_check=lambda m: checked.append(m.iteration))
-    assert result.converged and result.steps == 0 and checked == [0]
-    assert result.volume_kept > 0.99 and result.attack.worst > RESERVE and result.check.violations == 0
+    """Torque is ample for the two-link: the LB-CBF stands, and K is zero. The cart-pole's does not."""
+    _, result = train(two_link, PRESETS["default"], on_check=lambda m: pytest.fail("not needed"))
+    assert result.converged and result.steps == 0
+    assert result.volume_kept == 1.0 and result.attack.worst > RESERVE and result.check.violations == 0
+    q, v = draw(two_link, 100, seed=1)
+    for params in (result.params, without_term({**result.params, "ba": np.ones(12)})):
+        assert NumpyNetwork("convex", params).value(q, v).max() < 1e-12
 
     joined: list[int] = []
     join = MarginDescent.add_counterexamples

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.problem import Problem
+from ppcbf_robots.specs import Array
 
 Tensors = dict[str, torch.Tensor]
 # Training begins next to the LB-CBF, whose set is the largest, and K grows where margins ask for it.
 CONE, BOWL = 0.005, 0.002  # [m/s], first a of the speed terms
 UNIT = -6.5  # first a of the units, before its softplus
+NOTHING = -40.0  # any a, before its softplus, of a K that is zero to rounding
 CONSTANTS = ("in_shift", "in_scale", "turns", "v_scale", "energy_scale", "zero_at_rest")  # not trained
 
 
@@ -54,6 +57,15 @@ def initial_parameters(problem: Problem, preset: Preset, energy: float, generato
     p["Wb"], _ = _linear(width, units * nv, generator)
     p["bb"] = torch.randn(units * nv, generator=generator, dtype=torch.float64) * 2.0
     return p
+
+
+def without_term(params: dict[str, Array]) -> dict[str, Array]:
+    """Parameters of the same shapes with K = 0: the LB-CBF."""
+    off = {
+        name: np.full_like(x, NOTHING) for name, x in params.items() if name in ("ba", "cone_a", "bowl_a", "energy_a")
+    }
+    flat = {name: np.zeros_like(x) for name, x in params.items() if name in ("w_out", "b_out")}
+    return params | off | flat
 
 
 def _angles(problem: Problem) -> torch.Tensor:

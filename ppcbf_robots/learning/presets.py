@@ -46,7 +46,7 @@ class Preset:
     patience: int = 6  # clean checks in a row, without gain of volume, that end training early
     counterexample_copies: int = 15  # closed form: how often a counterexample's ray stands in the pool
     search_rounds: int = 0  # QP: of the falsifier at every check, per joint
-    judge_first: bool = False  # whether the evidence looks at the barrier that training begins with
+    judge_first: bool = False  # whether the evidence looks at the LB-CBF before training
     refinements: int = 4  # further rounds when the evidence finds violations
     refinement_share: float = 0.5  # of the planned iterations, added by each
     refinement_rate: float = 0.0  # of the learning rate, with which each begins; at least the last one

@@ -16,6 +16,7 @@ from ppcbf_robots.learning.descent import Descent, LearnedKind
 from ppcbf_robots.learning.falsifier import Attack
 from ppcbf_robots.learning.margin_descent import MarginDescent
 from ppcbf_robots.learning.paper_descent import PaperDescent
+from ppcbf_robots.learning.parameters import without_term
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem
@@ -146,7 +147,7 @@ class Trainer:
     ) -> Result:
         """Train until the planned iterations are done and the evidence is clean, or time is up.
 
-        The barrier that training begins with is judged first where the preset says so: it may need none.
+        The LB-CBF, whose set is the largest, is judged first where the preset says so: it may need no learned term.
         KeyboardInterrupt ends training and judges the best barrier so far.
         """
         interrupted = False
@@ -155,7 +156,7 @@ class Trainer:
         for round_ in range(-1 if at_once else 0, self.preset.refinements + 1):
             try:
                 if round_ < 0:
-                    self._look(on_check)
+                    self.clean = [(1.0, without_term(self.descent.snapshot()))]
                 else:
                     self._descend(on_check, time_limit)
             except KeyboardInterrupt:
@@ -184,14 +185,11 @@ class Trainer:
         while descent.iteration < descent.planned and time.monotonic() - self.started < time_limit:
             descent.iterate()
             if descent.iteration % self.preset.check_every == 0 or descent.iteration == descent.planned:
-                self._look(on_check)
+                monitor = self._check()
+                if on_check is not None:
+                    on_check(monitor)
                 if self._settled():
                     break
-
-    def _look(self, on_check: Callable[[Monitor], None] | None) -> None:
-        monitor = self._check()
-        if on_check is not None:
-            on_check(monitor)
 
     def _check(self) -> Monitor:
         """Fresh band states without the training margin, volume and start state."""
