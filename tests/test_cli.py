@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 
+from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.cli import output
 from ppcbf_robots.cli.compare import LEARNED
 from ppcbf_robots.cli.main import main
@@ -67,7 +68,7 @@ def small_presets() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, preset in PRESETS.items():
             small = {"rays": 1000, "samples": 100, "top": 20, "hidden": (16, 16), "test_samples": 200,
-                     "search_rounds": 1, "attack_rounds": 2}  # fmt: skip
+                     "search_rounds": 1, "attack_rounds": 2, "judge_first": False}  # fmt: skip
             patch.setitem(PRESETS, name, dataclasses.replace(preset, **small))
         yield
     torch.set_num_threads(threads)
@@ -212,6 +213,14 @@ def test_train_resumes_and_says_so_in_words(barrier, tmp_path):
 def test_train_checks_the_last_iteration_of_a_short_run(tmp_path):
     found = facts("train", "two_link", "circle", "--iterations", 3, "--out", tmp_path / "b")
     assert (found["converged"], found["steps"]) == (True, 3)
+
+
+def test_train_says_where_no_learned_term_is_needed(tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "default", dataclasses.replace(PRESETS["default"], judge_first=True))
+    done = run_cli("train", "two_link", "circle", "--out", tmp_path / "b")
+    assert done.code == 0 and "no learned term is needed here: K_theta = 0" in done.stdout
+    assert load_barrier(tmp_path / "b").data["training"]["history"] == []
+    assert run_cli("report", tmp_path / "b", "--duration", 0.2, "--steps", 100, "--out", tmp_path / "r.html").code == 0
 
 
 def test_training_that_does_not_converge_exits_3_with_the_barrier_written(tmp_path):

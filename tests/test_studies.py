@@ -48,7 +48,7 @@ def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
     """``cli(*arguments)`` runs ``ppcbf`` in a folder of its own, with presets that train on few states."""
     monkeypatch.chdir(tmp_path)
     small = {"rays": 500, "samples": 100, "top": 20, "hidden": (16, 16), "test_samples": 200, "refinements": 1,
-             "search_rounds": 1, "attack_rounds": 2}  # fmt: skip
+             "search_rounds": 1, "attack_rounds": 2, "judge_first": False}  # fmt: skip
     for name, preset in PRESETS.items():
         monkeypatch.setitem(PRESETS, name, dataclasses.replace(preset, **small))
 

@@ -17,7 +17,7 @@ import torch
 
 from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
 from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
-from ppcbf_robots.learning.parameters import Tensors
+from ppcbf_robots.learning.parameters import Tensors, without_term
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
@@ -32,11 +32,14 @@ POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
-MIN_MARGIN, MAX_MARGIN = 0.01, 0.3
+MIN_MARGIN, MAX_MARGIN = 0.02, 0.3
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 ENOUGH = 300  # violating states that end the evidence's search
 RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
+LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
+MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
+INSIDE = {"cone_a": 0.15, "bowl_a": 0.06, "ba": 0.05, "energy_a": 0.5}  # [m/s], each a then
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
@@ -51,11 +54,29 @@ class MarginDescent(Descent):
         self.margin = max(MIN_MARGIN, preset.first_margin * self._largest_margin)
         self._hunt = self.falsifier.start()  # goes on from check to check
         self._first_pool = len(self.rays)
+        if self._violated_without_term() > MANY:
+            self._begin_inside()
         self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
         self._weight: torch.Tensor = torch.tensor(self._max_weight, device=self.device)
         self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
         self.judged = {k: x.detach().clone() for k, x in self.params.items()}
         self._look()
+
+    @torch.no_grad()
+    def _violated_without_term(self) -> float:
+        """Share of rays that violate somewhere on the LB-CBF's band, of those that cross it."""
+        params = without_term({k: x.detach().cpu().numpy() for k, x in self.params.items()})
+        least = self.band.least_margin(
+            {k: self._tensor(x) for k, x in params.items()}, self.rays.select(slice(LOOKED_AT))
+        )[0]
+        return float((least < 0.0).sum() / torch.isfinite(least).sum().clamp(min=1))
+
+    @torch.no_grad()
+    def _begin_inside(self) -> None:
+        """A K so large that the set begins well inside the largest one."""
+        for name, a in INSIDE.items():
+            if name in self.params:
+                self.params[name].fill_(float(np.log(np.expm1(a))))
 
     def iterate(self) -> None:
         """A batch of band states, half of them where margins are small; one step; the weight's update."""
