@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ppcbf_robots.artefact import StoredBarrier, load_barrier
 from ppcbf_robots.band_tasks import BandJob, attack_tasks, conditions, sample_tasks
-from ppcbf_robots.certificate import Certificate, Condition, overall, save_certificate, subject
+from ppcbf_robots.certificate import Certificate, Condition, overall, save_certificate, subject, suffix
 from ppcbf_robots.cli.extras import needs
 from ppcbf_robots.cli.output import JsonOption, emit_json, err, out, table
 from ppcbf_robots.errors import CheckFailed, InputError
@@ -101,7 +101,7 @@ def verify(
         overall(judged), judged, _subject(stored), _not_covered(mass_error),
         round(time.monotonic() - began, 2), "samples" if reason else "proof", details,
     )  # fmt: skip
-    ending = _suffix(mass_error / 100.0)
+    ending = suffix(mass_error / 100.0)
     path = save_certificate(folder, certificate, f"certificate{ending}.json")
     files = [str(path), *_save_states(problem, folder / f"counterexamples{ending}.npz", states)]
     if json:
@@ -132,15 +132,6 @@ def _no_proof(problem: Problem, stored: StoredBarrier) -> str:
 def _subject(stored: StoredBarrier) -> dict[str, Any]:
     config = stored.filter_config()
     return subject(stored.data, config.margin, config.dt)
-
-
-def _suffix(mass_error: float) -> str:
-    """Files of a proof for other masses stand beside those of the model's."""
-    if mass_error == 0.0:
-        return ""
-    from ppcbf_robots.proof.prove import suffix
-
-    return suffix(mass_error)
 
 
 def _not_covered(mass_error: float) -> list[str]:

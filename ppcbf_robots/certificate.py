@@ -94,6 +94,11 @@ def subject(barrier: Mapping[str, Any], margin: float, dt: float) -> dict[str, A
     return {key: barrier.get(key) for key in keys} | {"margin": margin, "dt": dt}
 
 
+def suffix(mass_error: float) -> str:
+    """What the files of a proof for other masses have behind their names; they stand beside those of the model's."""
+    return f"_mass_{100.0 * mass_error:g}" if mass_error > 0.0 else ""
+
+
 def save_certificate(folder: Path, certificate: Certificate, name: str = NAME) -> Path:
     """Write it beside the barrier by an atomic rename."""
     path, temporary = folder / name, folder / f".{name}.tmp"

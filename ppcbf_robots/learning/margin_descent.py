@@ -17,7 +17,7 @@ import torch
 
 from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
 from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
-from ppcbf_robots.learning.parameters import Tensors, without_term
+from ppcbf_robots.learning.parameters import INSIDE, Tensors, without_term
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
@@ -39,7 +39,6 @@ ENOUGH = 300  # violating states that end the evidence's search
 RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
-INSIDE = {"cone_a": 0.15, "bowl_a": 0.06, "ba": 0.05, "energy_a": 0.5}  # [m/s], each a then
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 

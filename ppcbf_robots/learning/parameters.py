@@ -15,6 +15,7 @@ Tensors = dict[str, torch.Tensor]
 # Training begins next to the LB-CBF, whose set is the largest, and K grows where margins ask for it.
 CONE, BOWL = 0.005, 0.002  # [m/s], first a of the speed terms
 UNIT = -6.5  # first a of the units, before its softplus
+INSIDE = {"cone_a": 0.15, "bowl_a": 0.06, "ba": 0.05, "energy_a": 0.5}  # [m/s], each a of a set well inside the largest
 NOTHING = -40.0  # any a, before its softplus, of a K that is zero to rounding
 CONSTANTS = ("in_shift", "in_scale", "turns", "v_scale", "energy_scale", "zero_at_rest")  # not trained
 
@@ -61,9 +62,7 @@ def initial_parameters(problem: Problem, preset: Preset, energy: float, generato
 
 def without_term(params: dict[str, Array]) -> dict[str, Array]:
     """Parameters of the same shapes with K = 0: the LB-CBF."""
-    off = {
-        name: np.full_like(x, NOTHING) for name, x in params.items() if name in ("ba", "cone_a", "bowl_a", "energy_a")
-    }
+    off = {name: np.full_like(x, NOTHING) for name, x in params.items() if name in INSIDE}
     flat = {name: np.zeros_like(x) for name, x in params.items() if name in ("w_out", "b_out")}
     return params | off | flat
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ppcbf_robots.artefact import StoredBarrier
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.certificate import Condition, Verdict
+from ppcbf_robots.certificate import Condition, Verdict, suffix
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import FilterConfig, Status, free_power
@@ -65,11 +65,6 @@ class Proof:
 def state_name(mass_error: float = 0.0) -> str:
     """Name of the file that holds an unfinished proof, in the barrier's folder."""
     return f"verify{suffix(mass_error)}.npz"
-
-
-def suffix(mass_error: float) -> str:
-    """What the files of a proof for other masses have behind their names."""
-    return f"_mass_{100.0 * mass_error:g}" if mass_error > 0.0 else ""
 
 
 def obstacle_to_proof(problem: Problem, stored: StoredBarrier) -> str:
