@@ -129,10 +129,16 @@ def hold_at(
 @kernel
 def nearest(lower: Any, binding: Any, count: int) -> Any:
     """Indices, rising, of the ``count`` binding rows most in need of a correction; row 0 if none binds."""
-    found = np.flatnonzero(binding)
-    if len(found) > count:
-        found = np.sort(found[np.argsort(-lower[found])[:count]])
-    return found if len(found) > 0 else np.zeros(1, dtype=np.int64)
+    found, size = np.zeros(max(1, count), dtype=np.int64), 0  # the most in need first
+    for k in range(len(lower)):
+        if binding[k] and (size < count or lower[k] > lower[found[size - 1]]):
+            size = min(size + 1, count)
+            at = size - 1
+            while at > 0 and lower[found[at - 1]] < lower[k]:
+                found[at] = found[at - 1]
+                at -= 1
+            found[at] = k
+    return np.sort(found[: max(1, size)])
 
 
 @kernel
@@ -247,6 +253,21 @@ def rho_rows_at(
         phi[k] = hdot[k] + gamma * h[k] - K
         Lf[k] = curvature[k] + gamma * hdot[k] - K_q_rate - bias
     return hdot, phi, Lf, Lg, w
+
+
+@kernel
+def survey(h: Any, phi: Any, Lf: Any, Lg: Any, u_des: Any) -> tuple[bool, float, float]:
+    """Whether the barrier's rows and u_des (nv,) are finite, and where they are, the least h and phi of the rows."""
+    finite, least_h, least_phi = True, math.inf, math.inf
+    for k in range(len(phi)):
+        total = h[k] + phi[k] + Lf[k]
+        for j in range(Lg.shape[1]):
+            total += Lg[k, j]
+        finite = finite and math.isfinite(total)
+        least_h, least_phi = min(least_h, h[k]), min(least_phi, phi[k])
+    for j in range(len(u_des)):
+        finite = finite and math.isfinite(u_des[j])
+    return finite, least_h, least_phi
 
 
 @kernel

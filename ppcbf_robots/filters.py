@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.kernels import kernel
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array
 
@@ -90,9 +91,16 @@ class Correction:
     short: float = 0.0  # [m/s²] by which phi changes less over the period than psi(u) says, K being convex in v
 
 
-def is_slow(robot: RobotModel, v: Array) -> bool:
-    """Whether every joint is slower than NEAR_REST of its limit."""
-    return bool((np.abs(v) <= NEAR_REST * robot.v_max).all())
+@kernel
+def stays_slow(v: Any, Minv: Any, b: Any, u: Any, ahead: float, slow: Any) -> bool:
+    """Whether every joint is slower than ``slow`` (nv,), now and so long ahead [s] under a torque u (nv,)."""
+    found = True
+    for i in range(len(v)):
+        then = v[i]
+        for j in range(len(v)):
+            then += ahead * Minv[i, j] * (u[j] - b[j])
+        found = found and abs(v[i]) <= slow[i] and abs(then) <= slow[i]
+    return found
 
 
 def free_power(robot: RobotModel) -> float:

@@ -186,6 +186,7 @@ class NumpyNetwork:
         self.params = {k: np.asarray(w, dtype=np.float64) for k, w in params.items()}
         self.energy = float(energy_weight(np, self.params))
         self._packed: tuple[Any, ...] | None = None
+        self._last: tuple[Any, Any] | None = None  # the last single q, if it cannot change, and the units there
 
     def value(self, q: Any, v: Any) -> Any:
         """K (...) alone, without energy, for q (..., nq) and v (..., nv)."""
@@ -195,8 +196,11 @@ class NumpyNetwork:
         """See :func:`value_and_grad`; a single state is evaluated compiled, ten times faster."""
         if np.ndim(v) > 1:
             return value_and_grad(np, self.kind, self.params, q, v)
-        form = network_kernel.mlp if self.kind == "mlp" else network_kernel.convex
-        K, K_q, K_v = form(q, v, *self._arguments())
+        if self.kind == "mlp":
+            K, K_q, K_v = network_kernel.mlp(q, v, *self._arguments())
+        else:
+            K, K_q, K_v, units = network_kernel.convex(q, v, *self._arguments())
+            self._last = None if q.flags.writeable else (q, units)
         return np.float64(K), K_q, K_v
 
     def compiled(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -207,7 +211,10 @@ class NumpyNetwork:
     def of_velocity(self, q: Any) -> tuple[Any, ...]:
         """The convex form at q (nq,) as a function of v alone: the last arguments of ``network_kernel.rise``."""
         layers, form = self.compiled()
-        return *network_kernel.convex_units(q, *layers), *form
+        last_q, units = self._last or (None, None)
+        if last_q is not q:
+            units = network_kernel.convex_units(q, *layers)
+        return *units, *form
 
     def _arguments(self) -> tuple[Any, ...]:
         if self._packed is None:

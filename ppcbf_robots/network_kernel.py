@@ -149,7 +149,10 @@ def convex(
     Wa: Any, ba: Any, Wb: Any, bb: Any, Wc: Any, bc: Any,
     v_scale: Any, cone_a: Any, cone_b: Any, cone_c: Any, bowl_a: Any, bowl_b: Any, bowl_c: Any,
 ) -> Any:  # fmt: skip
-    """K, ∂K/∂q and ∂K/∂v of the convex form; Wa, Wc (units, width), Wb (units nv, width) are transposed."""
+    """K, ∂K/∂q and ∂K/∂v of the convex form, and what :func:`convex_units` returns.
+
+    Wa, Wc (units, width) and Wb (units nv, width) are transposed.
+    """
     nq, nv, units, width = len(q), len(v), len(ba), widths[-1]
     features, slopes = np.empty(3 * nq), np.empty((len(widths), widths.max()))
     a, c, b = _units(q, weights, widths, shift, scale, turns, Wa, ba, Wb, bb, Wc, bc, features, slopes)
@@ -168,7 +171,7 @@ def convex(
     for i in range(nq):
         cos, sin = features[nq + i], features[2 * nq + i]
         K_q[i] = g[i] * scale[i] + turns[i] * (cos * g[2 * nq + i] - sin * g[nq + i])
-    return K, K_q, K_v
+    return K, K_q, K_v, (a, c, b)
 
 
 @kernel

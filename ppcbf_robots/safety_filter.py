@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows, RhoBarrier
 from ppcbf_robots.closed_form import ClosedForm
+from ppcbf_robots.condense import survey
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.filters import Box, Correction, FilterConfig, Status, is_slow
+from ppcbf_robots.filters import NEAR_REST, Box, Correction, FilterConfig, Status, stays_slow
 from ppcbf_robots.qp_filter import QPFilter
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
@@ -26,6 +27,7 @@ from ppcbf_robots.state_check import StateCheck, is_finite_number
 log = logging.getLogger(__name__)
 
 RESTING_TIME = 0.02  # [s]
+_NOT_FINITE = "u_des, d_p or the barrier is not finite"
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,7 @@ class SafetyFilter:
         )
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
         self._last_status = Status.FREE
+        self._slow = NEAR_REST * robot.v_max
         config = self.config
         self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
         self._last_g: Array | None = None  # gravity torque of the last valid state
@@ -239,20 +242,24 @@ class SafetyFilter:
             self._moved = obstacles is not None
             self._slip.forget_step()  # another barrier
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
-        if not self._usable(rows, u_des, d_p):
-            reason, h, phi = "u_des, d_p or the barrier is not finite", float(rows.h.min()), float(rows.phi.min())
-            return self._fault(dyn, reason, h, phi, allowed=allowed)
+        usable, h, phi = self._survey(rows, u_des, d_p)
+        if not usable:
+            return self._fault(dyn, _NOT_FINITE, h, phi, allowed=allowed)
         if self._slip is None or t is None:
-            return self._answer(dyn, safety, rows, rows, u_des, d_p, obstacles is not None, allowed)
+            return self._answer(dyn, safety, rows, rows, h, phi, u_des, d_p, obstacles is not None, allowed)
         wary = self._slip.wary(t, rows)
-        result = self._answer(dyn, safety, rows, wary, u_des, d_p, obstacles is not None, allowed)
+        result = self._answer(dyn, safety, rows, wary, h, phi, u_des, d_p, obstacles is not None, allowed)
         if result.status is not Status.FAULT and math.isfinite(result.short):
             self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g, result.short)
         return result
 
-    def _usable(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> bool:
-        wanted = u_des.shape == (self.robot.nv,) and bool(np.isfinite(u_des).all()) and math.isfinite(d_p or 0.0)
-        return wanted and math.isfinite(rows.phi.sum() + rows.Lf_phi.sum() + rows.Lg_phi.sum())
+    def _survey(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> tuple[bool, float, float]:
+        """Whether a correction can be sought at all, and the least h and phi."""
+        if u_des.shape == (self.robot.nv,) and math.isfinite(d_p or 0.0):
+            finite, h, phi = survey(rows.h, rows.phi, rows.Lf_phi, rows.Lg_phi, u_des)
+            if finite:
+                return True, h, phi
+        return False, float(rows.h.min()), float(rows.phi.min())
 
     def _answer(
         self,
@@ -260,18 +267,19 @@ class SafetyFilter:
         safety: SafetyRows,
         rows: BarrierRows,
         wary: BarrierRows,
+        h: float,
+        phi: float,
         u_des: Array,
         d_p: float | None,
         moving: bool,
         allowed: Box | None,
     ) -> StepResult:
-        """The step for finite rows.
+        """The step for finite rows, the least of which are ``h`` and ``phi``.
 
         ``wary`` are the same rows lowered by the slip of phi; ``moving`` says that they are of obstacles which are not
         where the file has them.
         """
         offset = 0.0 if self.gravity_included else dyn.g
-        h, phi = float(rows.h.min()), float(rows.phi.min())
         pushed = moving and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
         budget = None if pushed else d_p
         correction = self._blind_correction if moving else self.correction
@@ -279,7 +287,7 @@ class SafetyFilter:
         if c.status is Status.FAULT:
             return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
         status = c.status
-        if status is Status.CORRECTING and c.row >= 0 and self._at_rest(dyn, c.u):
+        if status is Status.CORRECTING and c.row >= 0 and self._rests(dyn, c.u):
             status = Status.RESTING
         u = c.u - offset
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
@@ -317,10 +325,10 @@ class SafetyFilter:
         """The step for a valid state ``dyn``, number i of a screened batch, after the last one that this filter saw."""
         safety, rows, wary = screen.at(i)
         allowed = self._allowed(dyn.g)
-        if not self._usable(rows, u_des, d_p):
-            reason = "u_des, d_p or the barrier is not finite"
-            return self._count(self._fault(dyn, reason, float(rows.h.min()), float(rows.phi.min()), allowed=allowed))
-        return self._count(self._answer(dyn, safety, rows, wary, u_des, d_p, False, allowed))
+        usable, h, phi = self._survey(rows, u_des, d_p)
+        if not usable:
+            return self._count(self._fault(dyn, _NOT_FINITE, h, phi, allowed=allowed))
+        return self._count(self._answer(dyn, safety, rows, wary, h, phi, u_des, d_p, False, allowed))
 
     def _fault(
         self,
@@ -338,9 +346,9 @@ class SafetyFilter:
         u = np.clip(dyn.g - self.damping * dyn.v, *(allowed or (-self.robot.u_max, self.robot.u_max)))
         return StepResult(u if self.gravity_included else u - dyn.g, Status.FAULT, reason, h, phi, row)
 
-    def _at_rest(self, dyn: Dynamics, u: Array) -> bool:
+    def _rests(self, dyn: Dynamics, u: Array) -> bool:
         """Hardly any speed, now and RESTING_TIME ahead under u."""
-        return is_slow(self.robot, dyn.v) and is_slow(self.robot, dyn.v + RESTING_TIME * dyn.Minv @ (u - dyn.b))
+        return stays_slow(dyn.v, dyn.Minv, dyn.b, u, RESTING_TIME, self._slow)
 
     def _name(self, row: int) -> str:
         return self.safety.names[row] if row >= 0 else ""

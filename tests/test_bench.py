@@ -40,7 +40,7 @@ def test_command(tmp_path):
     assert done.exit_code == 0, done.output
     cases = json.loads(done.stdout)["cases"]
     assert {"robot", "pairs", "filter", "solver", "median_us", "p99_us", "max_us", "stages"} <= set(cases[0])
-    assert {c["solver"] for c in cases} >= {"daqp", "proxqp"}
+    assert {c["solver"] for c in cases} >= {"daqp", "proxqp", "quadprog"}
     assert {c["joints"] for c in cases} == {2, 5, 6, 7}
     assert picture.stat().st_size > 5_000
 

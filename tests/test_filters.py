@@ -201,10 +201,10 @@ def test_solvers_agree_with_the_exact_dual_of_one_row(data):
             np.testing.assert_allclose(z, expected, atol=1e-5)
 
 
-SOLVERS = [make_solver("proxqp"), make_solver("daqp")]
+SOLVERS = [make_solver(name) for name in ("proxqp", "daqp", "quadprog")]  # the last through qpsolvers
 
 
-@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+@pytest.mark.parametrize("solver", ["proxqp", "daqp", "quadprog"])
 def test_one_row_filter_against_the_exact_dual(panda, states, solver):
     """The filter itself with one pair, torque metric and equal torque limits."""
     base = panda.model
@@ -250,7 +250,7 @@ def test_one_row_in_the_kinetic_metric_pushes_along_w(two_link, states):
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+@pytest.mark.parametrize("solver", ["proxqp", "daqp", "quadprog"])
 def test_promises_hold_on_every_answer(problem, states, barrier_name, make_barrier, metric, solver):
     """In the box always; all rows and the passivity row where the status says so; u_des unchanged where it is FREE."""
     model, barrier = problem.model, make_barrier(problem, barrier_name)
