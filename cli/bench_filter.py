@@ -33,7 +33,7 @@ def bench(
     """Time the filter step, from (q, v) to torque, on states where the QP has to be solved.
 
     Without OBSTACLES: growing crowds of balls around ROBOT, several robots at about 126 pairs, and every solver that is
-    installed. The barrier is then a PP-NCBF of the default preset's size with random weights: time does not care.
+    installed. The barrier is then a PP-NCBF of the default preset's size, random but about as curved as trained ones.
 
     Example: ppcbf bench panda --steps 2000
     """

@@ -60,6 +60,8 @@ def train(
         problem = problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": gamma}))
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
+    for warning in problem.model.warnings:
+        err.print(f"warning: {warning}", style="yellow")
     states = None if counterexamples is None else load_states(counterexamples, problem.model)
     report = train_barrier(
         problem, barrier, preset, seed, out_dir, device, iterations, time_limit, resume, tensorboard, states

@@ -72,16 +72,18 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
     """
     spec = spec or ControllerSpec()
     rng = np.random.default_rng(SAMPLE_SEED)
-    inertia, g_max, Minvs = np.zeros(robot.nv), np.zeros(robot.nv), []
+    inertia, gravity, Minvs = np.zeros(robot.nv), [], []
     for q in robot.from_angles(domain.sample_q(rng, SAMPLES)):
         dyn = robot.evaluate(q, np.zeros(robot.nv))
         inertia += np.diag(dyn.M) / SAMPLES
-        g_max = np.maximum(g_max, np.abs(dyn.g))
+        gravity.append(np.abs(dyn.g))
         Minvs.append(dyn.Minv)
-    for i in np.flatnonzero(g_max > robot.u_max):
+    g_max, too_heavy = np.max(gravity, axis=0), np.mean(gravity > robot.u_max, axis=0)
+    for i in np.flatnonzero(too_heavy):
         robot.warnings.append(
             f"gravity alone takes up to {g_max[i]:.3g} of joint '{robot.joint_names[i]}', whose effort limit is "
-            f"{robot.u_max[i]:.3g}: such postures cannot be held; narrow domain.q"
+            f"{robot.u_max[i]:.3g}, and more than that in {too_heavy[i]:.1%} of X's postures: these cannot be held, and "
+            "no barrier is feasible where one of them rests at an obstacle; narrow domain.q, or give the true effort"
         )
     fastest = np.abs(domain.v).max(axis=1)
     room = np.maximum(robot.u_max - g_max, 0.05 * robot.u_max)

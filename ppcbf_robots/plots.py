@@ -225,7 +225,7 @@ def plot_bench(cases: Sequence[Case], robot: str, path: Path) -> None:
         ax.plot(x, [c.p99_us for c in shown], "k.:", label="whole step, 99 %")
         ax.set_xlabel("pairs of body sphere and obstacle" if key == "pairs" else "moving joints, at about 126 pairs")
         ax.grid(alpha=0.3)
-        ax.set_ylim(bottom=0.0)
+    axes[0].set_ylim(0.0, 1.05 * max(c.p99_us for c in (*grown, *wide)))  # of both
     axes[0].set_ylabel("filter step [µs]")
-    axes[0].legend(frameon=False, fontsize=8)
-    save_figure(fig, path)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="upper center", ncols=6, frameon=False, fontsize=8)
+    save_figure(fig, path, top=0.93)

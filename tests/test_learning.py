@@ -430,6 +430,26 @@ def test_a_margin_below_the_reserve_is_worth_one_refinement(two_link, monkeypatc
     assert len(asked) == (3 if worst < 0.0 else 0)
 
 
+def test_a_larger_candidate_that_failed_is_worth_one_refinement(two_link, monkeypatch):
+    """The smaller one stands meanwhile, nothing more is demanded, and the end is the largest that stands."""
+    trainer = Trainer(two_link, "pp-ncbf", dataclasses.replace(TINY, refinements=3))
+    volumes = iter([0.5, 0.9, 0.7, 0.6, 0.9, 0.8, 0.8])  # of six checks, two of them in the refinement, and the result
+    monkeypatch.setattr(trainer.descent, "volume_kept", lambda: next(volumes))
+    q, v = draw(two_link, 1, seed=2)
+    attacks = itertools.cycle([Attack(-0.1, q, v, 10), Attack(0.02, q[:0], v[:0], 10)])
+    monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: next(attacks))
+    monkeypatch.setattr(MarginDescent, "demand_more", lambda self: pytest.fail("a barrier stands"))
+    notes: list[str] = []
+    seen: list[Any] = []
+    result = trainer.run(lambda monitor: seen.append(trainer.descent.snapshot()), on_refine=notes.append)
+    assert notes == [
+        "the falsifier found states of too little margin, the least -0.1000: refining, "
+        "for a larger set than the one that stands"
+    ]
+    assert result.converged and result.attack is not None and result.attack.worst == 0.02
+    assert_same_weights(result.params, seen[5])  # 0.8, not the 0.7 of before the refinement
+
+
 def test_states_known_to_violate_make_a_search_needless(panda, monkeypatch):
     """They are looked at first; only if the parameters stand them the falsifier searches."""
     descent = margin_descent(panda)

@@ -24,6 +24,7 @@ from ppcbf_robots.specs import Array
 
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
 RESERVE_ROUNDS = 1  # refinements that states of too little margin are worth, where none violates
+GAIN_ROUNDS = 1  # refinements that a larger set is worth, where a smaller one stands
 CANDIDATES = 3  # clean parameter sets tried by the evidence
 APART = 5e-3  # of the LB set's volume, by which they differ at least: what is wrong with one is so with its like
 DESCENTS: dict[str, type[Descent]] = {"closed-form": PaperDescent, "qp": MarginDescent}  # by the filter that will run
@@ -152,6 +153,7 @@ class Trainer:
         """
         interrupted = False
         tested: list[Tested] = []
+        gained = 0
         at_once = self.preset.judge_first and self.descent.iteration == 0
         for round_ in range(-1 if at_once else 0, self.preset.refinements + 1):
             try:
@@ -168,14 +170,18 @@ class Trainer:
             tested = sorted([*tested, *found], key=lambda t: (t.violates, not t.clean, t.failures, -t.volume_kept))
             out_of_time = time.monotonic() - self.started > time_limit
             enough = bool(tested) and (tested[0].clean or (round_ >= RESERVE_ROUNDS and tested[0].stands))
-            if enough or interrupted or out_of_time or round_ == self.preset.refinements:
+            gained += enough
+            larger = any(t.volume_kept > tested[0].volume_kept for t in found)  # that did not stand
+            last = round_ == self.preset.refinements or (enough and (gained > GAIN_ROUNDS or not larger))
+            if last or interrupted or out_of_time:
                 break
             if round_ < 0:
                 self._join(found)
                 continue
-            self._refine(found)
+            self._refine(found, demanding=not enough)
             if on_refine is not None:
-                on_refine(f"{_said(found[-1]) if found else 'no clean barrier'}: refining")
+                wrong = _said(found[0]) if found else "no clean barrier"
+                on_refine(f"{wrong}: refining{', for a larger set than the one that stands' if enough else ''}")
         best = tested[0] if tested else Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
         return self._result(best, interrupted)
 
@@ -244,10 +250,10 @@ class Trainer:
         passive = self.kind == "pp-ncbf"
         return check_band(self.problem, barrier, self.filter_config, count, self.descent.rng, passive)
 
-    def _refine(self, tested: list[Tested]) -> None:
-        """The states found join, and training goes on for a while; where some violate, the descent asks for more."""
+    def _refine(self, tested: list[Tested], demanding: bool) -> None:
+        """The states found join, and training goes on for a while; if ``demanding``, with more asked where some violate."""
         self._join(tested)
-        if not tested or any(t.violates for t in tested):
+        if demanding and (not tested or any(t.violates for t in tested)):
             self.descent.demand_more()
         self.descent.planned = self.descent.iteration + int(self.preset.refinement_share * self.preset.iterations)
 
