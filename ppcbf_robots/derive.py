@@ -82,8 +82,8 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
     for i in np.flatnonzero(too_heavy):
         robot.warnings.append(
             f"gravity alone takes up to {g_max[i]:.3g} of joint '{robot.joint_names[i]}', whose effort limit is "
-            f"{robot.u_max[i]:.3g}, and more than that in {too_heavy[i]:.1%} of X's postures: these cannot be held, and "
-            "no barrier is feasible where one of them rests at an obstacle; narrow domain.q, or give the true effort"
+            f"{robot.u_max[i]:.3g}, and more than that in {too_heavy[i]:.1%} of X's postures: these cannot be held, "
+            "and no barrier is feasible where one rests at an obstacle; narrow domain.q, or give the true effort"
         )
     fastest = np.abs(domain.v).max(axis=1)
     room = np.maximum(robot.u_max - g_max, 0.05 * robot.u_max)

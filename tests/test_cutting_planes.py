@@ -48,18 +48,27 @@ def test_the_tangent_touches_K_at_the_end_of_the_period_and_lies_below_it_elsewh
         np.testing.assert_allclose(cut.w @ dyn.Minv, cut.Lg_phi, atol=1e-9 * np.abs(cut.Lg_phi).max())
 
 
-def falls_short(problem, barrier, config, count):
-    """By how much each correction lets a row fall short by the end of the period [m/s²], with K's true rise."""
-    runtime, rng, found = QPFilter(barrier, problem.safety, config), np.random.default_rng(1), []
-    domain, u_max = problem.robot.domain, problem.model.u_max
+def falls_short(problem, barrier, config, count, reach=None, given_up=False):
+    """By how much each correction lets a row fall short by the end of the period [m/s²], with K's true rise.
+
+    ``reach`` limits the rate: torques stay within that share of u_max about gravity. ``given_up`` looks at corrections
+    that leave the velocity domain, not at those that keep it.
+    """
+    domain, u_max, rng, found = problem.robot.domain, problem.model.u_max, np.random.default_rng(1), []
+    runtime = QPFilter(barrier, problem.safety, config, None if reach is None else reach * u_max / config.dt)
     for angles, v in zip(domain.sample_q(rng, count), 0.03 * domain.sample_v(rng, count), strict=True):
         dyn, safety, rows = state(problem, barrier, problem.model.from_angles(angles), v)
         if not 0.0 <= rows.phi.min() <= 0.3:
             continue
         u_des = dyn.g + rng.uniform(-0.5, 0.5, problem.model.nv) * u_max
-        answer = runtime.correct(dyn, safety, rows, u_des, None, u_max)
+        allowed = None
+        if reach is not None:
+            allowed = np.maximum(dyn.g - reach * u_max, -u_max), np.minimum(dyn.g + reach * u_max, u_max)
+        answer = runtime.correct(dyn, safety, rows, u_des, None, u_max, allowed)
         assert -1 <= answer.row < len(problem.safety.names)
-        if answer.status is Status.CORRECTING and "given up" not in answer.reason:
+        if allowed is not None:
+            assert np.all(answer.u >= allowed[0]) and np.all(answer.u <= allowed[1])
+        if answer.status is Status.CORRECTING and ("given up" in answer.reason) == given_up:
             short = EndOfPeriod(barrier.network, dyn, config.dt).tangent(answer.u).short
             assert answer.short == short
             separating = np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
@@ -69,14 +78,17 @@ def falls_short(problem, barrier, config, count):
     return np.array(found)
 
 
-def test_corrections_keep_the_rows_with_the_K_that_the_period_ends_with(two_link, make_barrier, monkeypatch):
+@pytest.mark.parametrize("case", [{}, {"reach": 0.3}, {"given_up": True}], ids=str)
+def test_corrections_keep_the_rows_with_the_K_that_the_period_ends_with(two_link, make_barrier, monkeypatch, case):
     """With tangents, up to what the margin covers; without them, K's kink lets rows fall short by far more."""
     barrier, config = make_barrier(two_link, "pp-ncbf-convex"), FilterConfig()
     barrier.network.params |= {"cone_a": np.array(0.0), "cone_c": np.array(-8.0)}  # a sharp kink at rest
+    if "given_up" in case:  # a velocity domain that no torque leads to
+        monkeypatch.setattr(two_link.safety, "v_domain", np.array([[1.0, 2.0]] * 2))
     tolerated = qp_filter.SHORT * config.alpha * config.margin
-    found = falls_short(two_link, barrier, config, 600)
+    found = falls_short(two_link, barrier, config, 600, **case)
     monkeypatch.setattr(qp_filter, "CUTS", 0)
-    without = falls_short(two_link, barrier, config, 600)
+    without = falls_short(two_link, barrier, config, 600, **case)
     assert len(found) > 20
     assert np.mean(found > 1.1 * tolerated) < 0.1 < 0.2 < np.mean(without > 1.1 * tolerated)
 

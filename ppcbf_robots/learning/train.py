@@ -251,7 +251,7 @@ class Trainer:
         return check_band(self.problem, barrier, self.filter_config, count, self.descent.rng, passive)
 
     def _refine(self, tested: list[Tested], demanding: bool) -> None:
-        """The states found join, and training goes on for a while; if ``demanding``, with more asked where some violate."""
+        """The states found join and training goes on for a while, ``demanding`` more where some violate."""
         self._join(tested)
         if demanding and (not tested or any(t.violates for t in tested)):
             self.descent.demand_more()
