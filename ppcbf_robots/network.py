@@ -186,7 +186,7 @@ class NumpyNetwork:
         self.params = {k: np.asarray(w, dtype=np.float64) for k, w in params.items()}
         self.energy = float(energy_weight(np, self.params))
         self._packed: tuple[Any, ...] | None = None
-        self._last: tuple[Any, Any] | None = None  # the last single q, if it cannot change, and the units there
+        self._last: tuple[Any, Any] = (None, ())  # the last single q, if it cannot change, and the units there
 
     def value(self, q: Any, v: Any) -> Any:
         """K (...) alone, without energy, for q (..., nq) and v (..., nv)."""
@@ -200,7 +200,7 @@ class NumpyNetwork:
             K, K_q, K_v = network_kernel.mlp(q, v, *self._arguments())
         else:
             K, K_q, K_v, units = network_kernel.convex(q, v, *self._arguments())
-            self._last = None if q.flags.writeable else (q, units)
+            self._last = (None if q.flags.writeable else q, units)
         return np.float64(K), K_q, K_v
 
     def compiled(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -211,7 +211,7 @@ class NumpyNetwork:
     def of_velocity(self, q: Any) -> tuple[Any, ...]:
         """The convex form at q (nq,) as a function of v alone: the last arguments of ``network_kernel.rise``."""
         layers, form = self.compiled()
-        last_q, units = self._last or (None, None)
+        last_q, units = self._last
         if last_q is not q:
             units = network_kernel.convex_units(q, *layers)
         return *units, *form
