@@ -17,7 +17,7 @@ import torch
 
 from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
 from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
-from ppcbf_robots.learning.parameters import INSIDE, Tensors, without_term
+from ppcbf_robots.learning.parameters import INSIDE, Tensors, before_softplus, without_term
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
@@ -75,7 +75,7 @@ class MarginDescent(Descent):
         """A K so large that the set begins well inside the largest one."""
         for name, a in INSIDE.items():
             if name in self.params:
-                self.params[name].fill_(float(np.log(np.expm1(a))))
+                self.params[name].fill_(before_softplus(a))
 
     def iterate(self) -> None:
         """A batch of band states, half of them where margins are small; one step; the weight's update."""

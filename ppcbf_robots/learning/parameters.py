@@ -47,17 +47,22 @@ def initial_parameters(problem: Problem, preset: Preset, energy: float, generato
     p["v_scale"] = 1.0 / v_max
     mean_square = nv / 3.0  # of |v / v_max| over X
     for form, a, b, c in (("cone", CONE, 1.0, 0.05), ("bowl", BOWL, math.sqrt(5.0 / mean_square), 5.0)):
-        c = c if form == "bowl" else math.log(math.expm1(c))
-        p[f"{form}_a"], p[f"{form}_c"] = (torch.tensor(x, dtype=torch.float64) for x in (math.log(math.expm1(a)), c))
+        c = c if form == "bowl" else before_softplus(c)
+        p[f"{form}_a"], p[f"{form}_c"] = (torch.tensor(x, dtype=torch.float64) for x in (before_softplus(a), c))
         p[f"{form}_b"] = torch.full((nv,), b, dtype=torch.float64)
     if nv > preset.covered_joints:
-        p["energy_a"] = torch.tensor(math.log(math.expm1(preset.energy)), dtype=torch.float64)
+        p["energy_a"] = torch.tensor(before_softplus(preset.energy), dtype=torch.float64)
         p["energy_scale"] = torch.tensor(1.0 / energy, dtype=torch.float64)
     p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), UNIT, dtype=torch.float64)
     p["Wc"], p["bc"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -1.0, dtype=torch.float64)
     p["Wb"], _ = _linear(width, units * nv, generator)
     p["bb"] = torch.randn(units * nv, generator=generator, dtype=torch.float64) * 2.0
     return p
+
+
+def before_softplus(a: float) -> float:
+    """The x of ``a = log(1 + exp(x))``, a > 0."""
+    return math.log(math.expm1(a))
 
 
 def without_term(params: dict[str, Array]) -> dict[str, Array]:
