@@ -11,6 +11,18 @@ from ppcbf_robots.kernels import kernel
 
 
 @kernel
+def class_k(hdot: float, phi: float, alpha: float, release: float, margin: float) -> float:
+    """What phi_k may fall by per second: the gain of a pair that separates rises from alpha to alpha + release."""
+    return alpha * (phi - margin) + release * max(0.0, min(hdot, phi))
+
+
+@kernel
+def tolerated(phi: float, alpha: float, margin: float, share: float) -> float:
+    """By how much psi_k may miss that for what K does in a period [m/s²]: phi settles above 0 all the same."""
+    return alpha * (share * margin + max(0.0, phi - margin))
+
+
+@kernel
 def condense(
     hdot: Any, phi: Any, Lf: Any, Lg: Any, Minv: Any, b: Any, v: Any, v_domain: Any, u_des: Any, u_max: Any,
     low: Any, high: Any, alpha: float, release: float, speed_alpha: float, margin: float, flat: float,
@@ -19,8 +31,8 @@ def condense(
 ) -> tuple[int, bool]:  # fmt: skip
     """Fill the rows ``C z >= lower`` of ``z = (u - u_des) / u_max``.
 
-    Rows 0 to R are ``psi_k(u) >= -alpha (phi_k - margin) - release max(0, min(ḣ_k, phi_k))``: the gain of a pair that
-    separates rises up to ``alpha + release``. Then follow for every joint of ``v_domain``
+    Rows 0 to R are ``psi_k(u) >= -alpha (phi_k - margin) - release max(0, min(ḣ_k, phi_k))``, see :func:`class_k`.
+    Then follow for every joint of ``v_domain``
     ``v̇ >= -speed_alpha (v - lowest)`` and ``-v̇ >= -speed_alpha (highest - v)``, which keep it in the velocity domain.
 
     Args:
@@ -50,7 +62,7 @@ def condense(
         joint = (k - R) // 2
         sign = 1.0 if (k - R) % 2 == 0 else -1.0
         if k < R:
-            slack = Lf[k] + alpha * (phi[k] - margin) + release * max(0.0, min(hdot[k], phi[k]))
+            slack = Lf[k] + class_k(hdot[k], phi[k], alpha, release, margin)
         else:
             slack = speed_alpha * sign * (v[joint] - v_domain[joint, 0 if sign > 0 else 1])
         length = 0.0
@@ -275,16 +287,14 @@ def falling_short(
     C: Any, lower: Any, norm: Any, phi: Any, z: Any, short: float, alpha: float, margin: float, share: float,
     flat: float,
 ) -> Any:  # fmt: skip
-    """Indices, rising, of the barrier's rows that a correction z leaves less than what phi_k tolerates.
+    """Indices, rising, of the barrier's rows that a correction z leaves less than what is :func:`tolerated`.
 
-    The rows are those of :func:`condense`, with ``short`` taken off psi_k; a row tolerates
-    ``alpha (share margin + max(0, phi_k - margin))``, all in units of phi̇.
+    The rows are those of :func:`condense`, with ``short`` taken off psi_k.
     """
     missed = np.empty(len(phi), dtype=np.bool_)
     for k in range(len(phi)):
         residual = -lower[k]
         for j in range(len(z)):
             residual += C[k, j] * z[j]
-        tolerated = alpha * (share * margin + max(0.0, phi[k] - margin))
-        missed[k] = residual * max(norm[k], flat) + tolerated < short
+        missed[k] = residual * max(norm[k], flat) + tolerated(phi[k], alpha, margin, share) < short
     return np.flatnonzero(missed)

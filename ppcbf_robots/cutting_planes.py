@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import BarrierRows
+from ppcbf_robots.condense import class_k, tolerated
 from ppcbf_robots.kernels import kernel
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.network_kernel import convex_units, rise
@@ -71,8 +72,8 @@ def hold_to_the_end(
             a, c, units_b = convex_units(q[s], *layers)
             short[s] = rise(v[s], u[s], M[s], Minv[s], b[s], dt, energy, a, c, units_b, *form)[0]
             for k in range(phi.shape[1]):
-                slack = Lf[s, k] + alpha * (phi[s, k] - margin) + release * max(0.0, min(hdot[s, k], phi[s, k]))
+                slack = Lf[s, k] + class_k(hdot[s, k], phi[s, k], alpha, release, margin)
                 for j in range(len(u[s])):
                     slack += Lg[s, k, j] * u[s, j]
-                if slack + alpha * (share * margin + max(0.0, phi[s, k] - margin)) < short[s]:
+                if slack + tolerated(phi[s, k], alpha, margin, share) < short[s]:
                     hold[s] = False
