@@ -161,15 +161,16 @@ def goal_column(c: dict[str, Any]) -> str:
 def table(path: Path) -> None:
     """The README's table from the output file."""
     print("| arm | world | pairs | least clearance [mm] | contacts | largest torque | V rise / V0 | goal | trained [s] "
-          "| violations | filter [µs] |\n|---|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+          "| set / LB | violations | filter [µs] |\n|---|---|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
     for line in path.read_text().splitlines():
         c = json.loads(line)
         if "note" in c:
-            print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {c['note']} | | | | | | | |")
+            print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {c['note']} | | | | | | | | |")
             continue
         hull = f" (hull: {c['hull_contacts']})" if c["hull_contacts"] else ""
         print(f"| {c['arm']} | {c['world']} | {c['pairs']} | {1e3 * c['clearance']:.1f} | {c['contacts']}{hull} "
               f"| {c['max_torque_ratio']:.2f} | {c['energy_rise']:.0e} | {goal_column(c)} | {c['train_s']:.0f} "
+              f"| {c['volume_kept']:.1%}{'' if c['converged'] else ' (not converged)'} "
               f"| {c['violations']} of {c['samples']} | {c['filter_us']:.0f} |")  # fmt: skip
 
 
