@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
+from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.campaign import Drawing, draw, outcome, run_cases, total
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, alarms_expected, emit_json, out, table
@@ -86,7 +87,8 @@ class Chunk:
         problem, _, config = self.load()
         folder = Path(self.barrier)
         trained = (folder / "barrier.json").read_text(encoding="utf-8") if folder.is_dir() else self.barrier
-        facts = [problem.fingerprint(), problem.robot.spec.barrier.model_dump(), trained, dataclasses.asdict(config)]
+        facts = [problem.fingerprint(), problem.robot.spec.barrier.model_dump(), trained, dataclasses.asdict(config),
+                 problem.model.u_rate.tolist()]  # fmt: skip
         key = {
             "robot": self.robot,
             "world": self.world,
@@ -184,6 +186,7 @@ def _facts(whole: Chunk, records: Sequence[Record]) -> dict[str, Any]:
     problem, barrier, config = whole.load()
     made = {**described(problem, barrier, config), "barrier": whole.barrier, "engine": whole.engine}
     made["effort_rate"] = whole.effort_rate
+    made["barrier_sha256"] = load_barrier(Path(whole.barrier)).digest if Path(whole.barrier).is_dir() else None
     seconds = round(sum(record["result"]["seconds"] for record in records), 1)
     return {**made, **dataclasses.asdict(whole.drawing), **total(outcomes), "seconds": seconds}
 

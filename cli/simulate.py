@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -89,8 +90,8 @@ def simulate(
 def limit_rate(problem: Problem, effort_rate: float | None) -> Problem:
     """The problem just loaded with another limit of how fast every torque may change [N m/s | N/s]."""
     if effort_rate is not None:
-        if not effort_rate > 0.0:
-            raise InputError(f"--effort-rate: must be a positive number, got {effort_rate:g}")
+        if not 0.0 < effort_rate < math.inf:
+            raise InputError(f"--effort-rate: must be a positive finite number, got {effort_rate:g}")
         problem.model.u_rate = np.full(problem.model.nv, effort_rate)
     return problem
 

@@ -16,7 +16,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from ppcbf_robots.barriers import Barrier, BarrierKind
-from ppcbf_robots.certificate import Certificate, load_certificate
+from ppcbf_robots.certificate import Certificate, digest, load_certificate, subject
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
 from ppcbf_robots.network import NetworkKind, NumpyNetwork, Params
@@ -49,6 +49,11 @@ class StoredBarrier:
     filter: dict[str, Any]  # kind, metric and alpha of the filter it was trained for
     data: dict[str, Any]  # barrier.json
     certificate: Certificate | None = None  # what `ppcbf verify` found out; None if it was not asked, or of another
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of weights, constants, filter, robot, world and goal."""
+        return digest(subject(self.data, 0.0, 0.0))
 
     def filter_config(self, **changes: Any) -> FilterConfig:
         """Settings of the filter the barrier was trained for, with changes such as ``dt`` or ``solver``."""
@@ -130,11 +135,12 @@ def load_barrier(folder: Path) -> StoredBarrier:
         InputError: if anything is missing, altered or not finite.
     """
     path = folder / "barrier.json"
+    for file in (path, folder / "weights.safetensors"):
+        if not file.is_file():
+            raise InputError(f"{folder} is not a barrier folder: {file.name} is missing")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         weights = (folder / "weights.safetensors").read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{folder} is not a barrier folder: {Path(error.filename).name} is missing") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     if isinstance(data, dict) and data.get("format") in range(1, FORMAT):

@@ -39,7 +39,7 @@ class BandJob:
     robot: str
     world: str
     folder: Path
-    weights: str  # SHA-256: fixes the draws, so that no barrier can have been trained on them
+    about: str  # SHA-256 of what the certificate is about: fixes the draws, so that no barrier was trained on them
     seed: int
 
     def load(self) -> tuple[Problem, StoredBarrier]:
@@ -51,11 +51,11 @@ class BandJob:
 
     def rng(self, *stream: int) -> np.random.Generator:
         """Random numbers of one task."""
-        return np.random.default_rng([self.seed, int(self.weights[:16], 16), *stream])
+        return np.random.default_rng([self.seed, int(self.about[:16], 16), *stream])
 
     def key(self, **more: Any) -> dict[str, Any]:
         """Key of a task."""
-        return {"robot": self.robot, "world": self.world, "weights": self.weights, "seed": self.seed, **more}
+        return {"robot": self.robot, "world": self.world, "about": self.about, "seed": self.seed, **more}
 
 
 def sample_tasks(job: BandJob, samples: int) -> list[Task]:

@@ -163,7 +163,9 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
         "contact": clearance < 0.0 if contacts is None else contacts["steps"] > 0,
         "beyond_limit": bool(beyond.any()),
         "torque": float(np.max(np.abs(run.u[known]) / problem.model.u_max)),
-        "rate": _rate(problem.model, run.u[known], float(run.t[-1]) / max(1, len(run.t) - 1)),
+        "rate": _rate(
+            problem.model, run.u[known & (run.status != Status.STOP)], float(run.t[-1]) / max(1, len(run.t) - 1)
+        ),
         "energy_rise": rise,
         "energy_share": rise / max(float(unexplained[0]), ENERGY_FLOOR),
         "injected": float(np.max(unexplained - np.minimum.accumulate(unexplained))),

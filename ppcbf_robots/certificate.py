@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
+
+from pydantic import TypeAdapter
 
 from ppcbf_robots.errors import InputError
 
@@ -94,6 +97,11 @@ def subject(barrier: Mapping[str, Any], margin: float, dt: float) -> dict[str, A
     return {key: barrier.get(key) for key in keys} | {"margin": margin, "dt": dt}
 
 
+def digest(about: Mapping[str, Any]) -> str:
+    """SHA-256 of a :func:`subject`."""
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+
 def suffix(mass_error: float) -> str:
     """What the files of a proof for other masses have behind their names; they stand beside those of the model's."""
     return f"_mass_{100.0 * mass_error:g}" if mass_error > 0.0 else ""
@@ -122,12 +130,13 @@ def load_certificate(folder: Path, barrier: Mapping[str, Any]) -> Certificate | 
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         assert data.pop("format") == FORMAT
-        data["conditions"] = {name: Condition(**c) for name, c in data["conditions"].items()}
-        found = Certificate(**data)
-        assert all(v in get_args(Verdict) for v in (found.verdict, *(c.verdict for c in found.conditions.values())))
+        found = TypeAdapter(Certificate).validate_python(data)
         assert found.verdict == overall(found.conditions)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, AssertionError):
+        margin, dt, *_ = numbers = [found.subject["margin"], found.subject["dt"]]
+        numbers += [found.details.get(key, 0.0) for key in ("power", "mass_error")]
+        assert all(isinstance(x, int | float) for x in numbers)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, AssertionError, RecursionError):
         raise InputError(f"{path}: not a certificate of this version; run `ppcbf verify {folder}` again") from None
-    if found.subject != subject(barrier, *(found.subject.get(k, 0.0) for k in ("margin", "dt"))):
+    if found.subject != subject(barrier, margin, dt):
         raise InputError(f"{path}: belongs to another barrier (its hashes differ); run `ppcbf verify {folder}` again")
     return found

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict, PositiveInt
 
 from ppcbf_robots import viewer
 from ppcbf_robots.artefact import StoredBarrier
@@ -18,7 +19,41 @@ from ppcbf_robots.report_page import Badge, Tone, render_report
 from ppcbf_robots.report_parts import PARTS, VERDICTS, Material, percent, same_barrier
 from ppcbf_robots.resources import portable
 
-CAMPAIGN_KEYS = ("rollouts", "contacts", "limit_violations", "torque_violations", "rate_violations", "diverged")
+
+class Figures(BaseModel):
+    """What a report shows of ``campaign.json``."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    robot: str
+    obstacles: str
+    barrier: str
+    barrier_sha256: str | None
+    barrier_kind: str
+    engine: str
+    duration: float
+    pushes: bool
+    mass_error: float
+    rollouts: PositiveInt
+    contacts: int
+    limit_violations: int
+    torque_violations: int
+    rate_violations: int
+    diverged: int
+    qp_failures: int
+    fallbacks: int
+    goals_reached: int
+    resting: int
+    stalled: int
+    moving: int
+    min_h: float
+    median_min_h: float
+    min_clearance: float
+    max_energy_rise: float
+    max_energy_share: float
+    max_injected: float
+    max_torque_ratio: float
+    failed: list[int]
 
 
 def read_campaign(path: Path, problem: Problem) -> dict[str, Any]:
@@ -33,19 +68,18 @@ def read_campaign(path: Path, problem: Problem) -> dict[str, Any]:
     """
     path = path / "campaign.json" if path.is_dir() else path
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-        assert all(isinstance(facts[key], int) for key in CAMPAIGN_KEYS)
-        names = facts["robot"], facts["obstacles"]
+        facts = Figures.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"campaign not found: {path}; make one with `ppcbf campaign`") from None
-    except (OSError, ValueError, KeyError, TypeError, AssertionError):
+    except (OSError, ValueError):  # pydantic's errors are of the latter
         raise InputError(f"{path}: not the campaign.json of `ppcbf campaign`") from None
+    names = facts.robot, facts.obstacles
     if names != (portable(problem.robot.name), portable(problem.world_name)):
         raise InputError(
             f"{path}: a campaign of '{names[0]}' in '{names[1]}', but the report is about "
             f"'{problem.robot.name}' in '{problem.world_name}'"
         )
-    return dict(facts)
+    return facts.model_dump()
 
 
 def time_filter(problem: Problem, barrier: Barrier, stored: StoredBarrier, steps: int) -> Case:

@@ -24,8 +24,7 @@ VERDICTS: dict[str, tuple[Tone, str]] = {
     "proved": ("good", "Every condition holds on the whole band: proved, with rounding errors accounted for."),
     "bounded": (
         "good",
-        "Not proved, but bounded: independent random states of the band show that violations, if there are any, are "
-        "rare, and a gradient search found none.",
+        "Not proved, but bounded: independent random states of the band show that violations, if any, are rare.",
     ),
     "refuted": ("bad", "Refuted: states are known in which a condition does not hold."),
     "undecided": ("warn", "Undecided: neither proved nor refuted with the time or samples given."),
@@ -133,6 +132,15 @@ def _certificate(m: Material) -> Section:
             for name, c in found.conditions.items()]  # fmt: skip
     table = Table("Conditions", ["condition", "what it says", "verdict", "how certain", "least margin"], rows)
     text = [VERDICTS[found.verdict][1], f"Found by {found.method} in {_seconds(found.seconds)}."]
+    if found.method == "samples":
+        without, tried = found.details.get("no_attack"), found.details.get("attacked", 0)
+        known = sum(c.verdict == "refuted" for c in found.conditions.values())
+        result = "states that break a condition are known" if known else "found none that breaks a condition"
+        text.append(
+            f"No search went after single states: {without}."
+            if without
+            else f"A search over {tried:,} states: {result}."
+        )
     return Section("certificate", "Certificate", text, [table], notes=found.not_covered, noted="Not covered")
 
 
@@ -182,7 +190,8 @@ def _campaign(m: Material) -> Section:
         + (f"; {' and '.join(given)}." if given else ".")
     ]
     if not same_barrier(m):
-        text.append(f"These runs used another barrier: {facts['barrier']}.")
+        now = m.campaign is not None and m.campaign["barrier"] == str(m.folder.resolve())
+        text.append(f"These runs used another barrier: {'one that was here before' if now else facts['barrier']}.")
     rows = [
         ["runs with a contact", str(facts["contacts"])],
         ["runs beyond a torque limit", str(facts["torque_violations"])],
@@ -190,20 +199,26 @@ def _campaign(m: Material) -> Section:
         ["runs beyond a joint limit", str(facts["limit_violations"])],
         ["runs that diverged", str(facts["diverged"])],
         ["least h", f"{facts['min_h']:.6f} (median of the runs {facts['median_min_h']:.4f})"],
+        ["least clearance", f"{facts['min_clearance']:.6f} m"],
+        [
+            "most energy above V0 and pushes",
+            f"{facts['max_energy_rise']:.3g} J ({facts['max_energy_share']:.2g} of V0)",
+        ],
         ["most energy injected", f"{facts['max_injected']:.3g} J"],
         ["largest torque", f"{facts['max_torque_ratio']:.1%} of its limit"],
         ["control steps without a solution", str(facts["qp_failures"])],
         ["control steps below the full QP", str(facts["fallbacks"])],
         ["goals reached", f"{facts['goals_reached']} ({facts['goals_reached'] / facts['rollouts']:.0%})"],
         ["held by an obstacle or limit", str(facts["resting"])],
+        ["at rest elsewhere", str(facts["stalled"])],
         ["still moving at the end", str(facts["moving"])],
     ]
     return Section("campaign", "Campaign", text, [Table("What was counted", [], rows)])
 
 
 def same_barrier(m: Material) -> bool:
-    """Whether the campaign ran with the barrier of the report, as far as its folder says."""
-    return m.campaign is not None and m.campaign["barrier"] == str(m.folder.resolve())
+    """Whether the campaign ran with the barrier of the report, as it is now."""
+    return m.campaign is not None and m.campaign["barrier_sha256"] == m.stored.digest
 
 
 def _latency(m: Material) -> Section:

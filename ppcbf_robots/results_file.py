@@ -64,7 +64,7 @@ class ResultsFile:
                     finished[name_of(record["key"])] = record
                 else:
                     assert "error" in record
-            except (ValueError, TypeError, KeyError, AssertionError):
+            except (ValueError, TypeError, KeyError, AssertionError, RecursionError):
                 raise InputError(f"{self.path}: line {number} is no result of a sweep; give another folder") from None
         self._file.truncate(whole)
         return finished

@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 RESTING_TIME = 0.02  # [s]
 _NOT_FINITE = "u_des, d_p or the barrier is not finite"
+_NUMBERS = dict.fromkeys(map(ord, "0123456789.e+-"))  # left out where two reasons are compared
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class SafetyFilter:
             for b in (barrier, self._blind)
         )
         self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
-        self._last_status = Status.FREE
+        self._logged: tuple[Status, str] = Status.FREE, ""
         self._slow = NEAR_REST * robot.v_max
         config = self.config
         self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
@@ -123,6 +124,7 @@ class SafetyFilter:
         """Forget the last state and torque, for a clock that starts anew or an arm that was moved by other means."""
         self._check.reset()
         self._last_g, self._invalid_steps = None, 0
+        self._logged = Status.FREE, ""
         self._sent.clear()
         if self._slip is not None:
             self._slip.reset()
@@ -169,6 +171,7 @@ class SafetyFilter:
             limit, and keeps the rate.
         """
         q, v, u_des = (_numbers(x) for x in (q, v, u_des))
+        d_p = d_p.item() if isinstance(d_p, np.ndarray) and d_p.ndim == 0 else d_p
         problem = self._check.problem(t, q, v, age)
         unknown = "" if u_last is None else self._tell(u_last)
         if problem:
@@ -238,9 +241,8 @@ class SafetyFilter:
         the state stands on its own: nothing is learned from it of the slip of phi.
         """
         safety = self.safety.evaluate(dyn, obstacles)
-        if self._slip is not None and t is not None and self._moved != (obstacles is not None):
-            self._moved = obstacles is not None
-            self._slip.forget_step()  # another barrier
+        if t is not None and self._moved != (obstacles is not None):
+            self._change_barrier(obstacles is not None)
         rows = (self.barrier if obstacles is None else self._blind).rows(dyn, safety)
         usable, h, phi = self._survey(rows, u_des, d_p)
         if not usable:
@@ -253,9 +255,17 @@ class SafetyFilter:
             self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g, result.short)
         return result
 
+    def _change_barrier(self, moved: bool) -> None:
+        """From the trained barrier to the LB-CBF where obstacles are elsewhere, and back."""
+        self._moved = moved
+        if self._slip is not None:
+            self._slip.forget_step()
+        if getattr(self.barrier, "network", None) is not None:
+            log.warning("obstacles %s", "are elsewhere: K = 0 until they are back" if moved else "are back: K is, too")
+
     def _survey(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> tuple[bool, float, float]:
         """Whether a correction can be sought at all, and the least h and phi."""
-        if u_des.shape == (self.robot.nv,) and math.isfinite(d_p or 0.0):
+        if u_des.shape == (self.robot.nv,) and (d_p is None or is_finite_number(d_p)):
             finite, h, phi = survey(rows.h, rows.phi, rows.Lf_phi, rows.Lg_phi, u_des)
             if finite:
                 return True, h, phi
@@ -362,21 +372,22 @@ class SafetyFilter:
         held = self._invalid_steps * self.config.dt
         if self._check.last is not None and is_finite_number(t):
             held = max(held, t - self._check.last[0])
-        if self._last_g is not None and held <= self.config.max_hold:
-            u = np.clip(self._last_g, -self.robot.u_max, self.robot.u_max)
-            u = u if self.gravity_included else np.zeros_like(u)
-            if self._sent:
-                u = np.clip(u, self._sent[-1] - self._step_limit, self._sent[-1] + self._step_limit)
-            return StepResult(u, Status.INVALID, problem, np.nan, np.nan, "")
+        g, u_max = self._last_g, self.robot.u_max
+        if g is not None and held <= self.config.max_hold:
+            u = np.clip(g, *(self._allowed(g) or (-u_max, u_max)))
+            return StepResult(u if self.gravity_included else u - g, Status.INVALID, problem, np.nan, np.nan, "")
         return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
 
     def _count(self, result: StepResult) -> StepResult:
         self.counts[result.status] += 1
         self._sent.append(result.u)
-        if result.status is not self._last_status:  # a change, not every tick of a lasting alarm
-            level = logging.WARNING if result.status >= Status.PASSIVITY_DROPPED else logging.DEBUG
-            log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)
-            self._last_status = result.status
+        alarm = result.status >= Status.PASSIVITY_DROPPED
+        if alarm or result.status is not self._logged[0]:
+            said = result.status, result.reason.translate(_NUMBERS) if alarm else ""
+            if said != self._logged:  # a change, not every tick of a lasting alarm
+                level = logging.WARNING if alarm else logging.DEBUG
+                log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)
+                self._logged = said
         return result
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from ppcbf_robots import kernels
@@ -19,6 +19,7 @@ from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Ob
 EDGE = 0.01  # [m], rho of boxes, capsules and cylinders: the width over which an edge is rounded
 MESH_GAP = 0.005  # [m], how far a convex mesh's smooth maximum lies below the distance to its faces
 EDGE_STEP = 0.3  # [rad], between neighbouring supporting planes around an edge of a convex mesh
+ROTATION_TOLERANCE = 1e-3  # of RᵀR - 1, for matrices from a tracker
 DIRECTIONS = 162  # supporting planes of a convex mesh besides its faces: they round its corners
 
 
@@ -50,20 +51,26 @@ class Packed:
         """The same obstacles, some of them elsewhere and moving.
 
         Raises:
-            InputError: for a name that is not in the world, or numbers that are not finite.
+            InputError: for a name that is not in the world, or what is not a motion: other shapes, numbers that are not
+                finite, a matrix that does not rotate.
         """
         frames, rates = self.frames.copy(), self.motions.copy()
+        if not isinstance(motions, Mapping):
+            raise InputError(f"motions: expected a Motion by obstacle name, got {type(motions).__name__}")
         for name, motion in motions.items():
             if name not in self.names:
                 raise InputError(f"no obstacle is named '{name}' (obstacles: {', '.join(self.names)})")
+            if not isinstance(motion, Motion):
+                raise InputError(f"obstacle '{name}': expected a Motion, got {type(motion).__name__}")
             o = self.names.index(name)
             if motion.rotation is not None:
-                frames[o, :, :3] = motion.rotation
+                frames[o, :, :3] = R = _finite(name, "rotation", motion.rotation, (3, 3))
+                if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+                    raise InputError(f"obstacle '{name}': rotation is not a rotation matrix")
             if motion.xyz is not None:
-                frames[o, :, 3] = motion.xyz
-            rates[o] = motion.velocity, motion.acceleration, motion.angular_velocity
-            if not (np.all(np.isfinite(frames[o])) and np.all(np.isfinite(rates[o]))):
-                raise InputError(f"obstacle '{name}': its position and motion must be finite numbers")
+                frames[o, :, 3] = _finite(name, "xyz", motion.xyz, (3,))
+            for i, what in enumerate(("velocity", "acceleration", "angular_velocity")):
+                rates[o, i] = _finite(name, what, getattr(motion, what), (3,))
         return dataclasses.replace(self, frames=frames, motions=rates)
 
     def distance(self, o: int, p: Array) -> float:
@@ -75,6 +82,17 @@ class Packed:
         """:func:`ppcbf_robots.kernels.core` of obstacle o, for a point and its velocity in the obstacle's frame."""
         first, end = int(self.plane_start[o]), int(self.plane_start[o + 1])
         return kernels.core(int(self.kinds[o]), x, w, self.sizes[o], self.planes, first, end)
+
+
+def _finite(name: str, what: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Finite numbers of a shape, or an InputError that names the obstacle."""
+    try:
+        x = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        x = np.zeros(0)
+    if x.shape != shape or not np.all(np.isfinite(x)):
+        raise InputError(f"obstacle '{name}': {what} must be finite numbers of shape {shape}")
+    return x
 
 
 def pack(obstacles: Sequence[Obstacle]) -> Packed:

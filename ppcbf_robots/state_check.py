@@ -112,5 +112,8 @@ def look(
 
 
 def is_finite_number(x: object) -> bool:
-    """Whether x is a real number, neither NaN nor infinite."""
-    return isinstance(x, int | float | np.number) and bool(np.isfinite(x))
+    """Whether x is a real number, neither NaN nor infinite, and no larger than a float can be."""
+    try:
+        return isinstance(x, int | float | np.integer | np.floating) and math.isfinite(x)
+    except OverflowError:
+        return False

@@ -46,7 +46,8 @@ def _joints(robot: RobotModel) -> list[_Joint]:
     pin.computeJointJacobians(model, data, pin.neutral(model))
     joints = []
     for i in range(1, model.njoints):
-        S = pin.getJointJacobian(model, data, i, pin.ReferenceFrame.LOCAL)[:, model.joints[i].idx_v]
+        J = pin.getJointJacobian(model, data, i, pin.ReferenceFrame.LOCAL).reshape(6, -1)  # a single joint's comes flat
+        S = J[:, model.joints[i].idx_v]
         T = model.jointPlacements[i]
         joints.append(_Joint(int(model.parents[i]), T.rotation.copy(), T.translation.copy(), S,
                              model.inertias[i].matrix()))  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 
 import numpy as np
 import pytest
@@ -154,7 +155,9 @@ def test_missing_files(folder, tmp_path):
     assert refusal(folder) == f"{folder} is not a barrier folder: weights.safetensors is missing"
     assert refusal(tmp_path / "none") == f"{tmp_path / 'none'} is not a barrier folder: barrier.json is missing"
     (tmp_path / "file").write_text("")
-    assert refusal(tmp_path / "file").startswith(f"{tmp_path / 'file'}/barrier.json: cannot be read (")
+    assert refusal(tmp_path / "file") == f"{tmp_path / 'file'} is not a barrier folder: barrier.json is missing"
+    os.mkfifo(tmp_path / "barrier.json")  # reading it would wait for ever
+    assert refusal(tmp_path) == f"{tmp_path} is not a barrier folder: barrier.json is missing"
 
 
 @pytest.mark.parametrize("key", ["kind", "network", "formula", "filter", "fingerprint", "weights_sha256", "robot",

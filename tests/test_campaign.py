@@ -13,6 +13,7 @@ import pytest
 
 from ppcbf_robots.batch_dynamics import BatchDynamics
 from ppcbf_robots.campaign import CLEAR, Drawing, draw, outcome, run_cases, total
+from ppcbf_robots.cli.campaign import Chunk, _load
 from ppcbf_robots.cli.main import main
 from ppcbf_robots.engines import PinocchioEngine
 from ppcbf_robots.errors import InputError
@@ -20,6 +21,7 @@ from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.lockstep import Case, simulate_together
 from ppcbf_robots.plant import perturbed
 from ppcbf_robots.pushes import Push, PushedEngine, push_torques
+from ppcbf_robots.resources import find_robot
 from ppcbf_robots.rollout import FIELDS, Trajectory, simulate
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.viewer import check_trajectories
@@ -232,6 +234,18 @@ def test_campaign_goes_on_and_replays(tmp_path: Path, monkeypatch, capsys):
     check_trajectories(_two_link(), [again], ["again"])  # as the viewer does
     assert run(*base, "--rollouts", 4, "--barrier", "none", *here, monkeypatch=monkeypatch) in (0, 3)
     assert len((tmp_path / "c" / "results.jsonl").read_text().splitlines()) == 5  # another barrier, other results
+
+
+def test_results_with_other_torque_rates_are_other_results(tmp_path: Path):
+    spec = tmp_path / "slow.yaml"
+    text = find_robot("two_link").read_text().replace("urdf: ", f"urdf: {find_robot('two_link').parent}/")
+    keys = []
+    for rate in (1000, 50):
+        spec.write_text(f"{text}\neffort_rate: {rate}\n")
+        chunk = Chunk(str(spec), "circle", "lb-cbf", None, None, "pinocchio", None, Drawing(), range(2))
+        keys.append(chunk.task().key)
+        _load.cache_clear()
+    assert keys[0] != keys[1] and keys[0]["robot"] == keys[1]["robot"]
 
 
 def _two_link():

@@ -94,6 +94,11 @@ def test_a_last_torque_outside_the_box_leads_back_into_it(two_link):
     model = two_link.model
     result = limited(two_link).step(0.0, two_link.robot.start, np.zeros(2), np.zeros(2), u_last=3.0 * model.u_max)
     np.testing.assert_allclose(result.u, model.u_max)
+    filter_ = limited(two_link)
+    filter_.step(0.0, two_link.robot.start, np.zeros(2), np.zeros(2))
+    bridged = filter_.step(0.001, [np.nan, 0.0], np.zeros(2), np.zeros(2), u_last=3.0 * model.u_max)
+    assert bridged.status is Status.INVALID
+    np.testing.assert_allclose(bridged.u, model.u_max)
 
 
 @pytest.mark.parametrize("u_last", [[np.nan, 0.0], [1.0], "x"])
@@ -326,4 +331,4 @@ def test_commands_take_the_rate(tmp_path, two_link):
     assert told("info", "two_link")["joints"][0]["effort_rate"] is None
     wrong = CliRunner().invoke(app, ["simulate", "two_link", "circle", "--effort-rate", "-1"])
     assert isinstance(wrong.exception, InputError)
-    assert str(wrong.exception) == "--effort-rate: must be a positive number, got -1"
+    assert str(wrong.exception) == "--effort-rate: must be a positive finite number, got -1"

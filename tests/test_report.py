@@ -82,6 +82,11 @@ def test_report_says_what_is_known(trained, tmp_path, browser, monkeypatch, caps
     ):  # fmt: skip
         assert expected in text, f"{expected!r} is not in {text!r}"
     assert "another barrier" not in text
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps(facts | {"barrier_sha256": "0" * 64}))  # trained again since, in the same folder
+    given = ("report", trained, "--campaign", other, *SHORT, "--out", tmp_path / "other.html")
+    assert run(*given, monkeypatch=monkeypatch) == 0
+    assert "another barrier: one that was here before" in (tmp_path / "other.html").read_text("utf-8")
     pictures = browser.evaluate("[...document.images].map((x) => [x.decode && x.alt.length > 40, x.src.slice(0, 26)])")
     assert pictures == [[True, "data:image/svg+xml;base64,"]] * 3
     browser.evaluate("for (const x of document.images) x.loading = 'eager'")
@@ -150,7 +155,14 @@ def test_what_does_not_belong_is_refused(trained, tmp_path, monkeypatch, capsys)
     wrong.write_text("[1]")
     assert "not the campaign.json of `ppcbf campaign`" in refused(trained, "--campaign", wrong)
     keys = ("rollouts", "contacts", "limit_violations", "torque_violations", "rate_violations", "diverged")
-    wrong.write_text(json.dumps(dict.fromkeys(keys, 0) | {"robot": "panda", "obstacles": "sphere"}))
+    wrong.write_text(json.dumps(dict.fromkeys(keys, 0) | {"robot": "two_link", "obstacles": "circle"}))
+    assert "not the campaign.json of `ppcbf campaign`" in refused(trained, "--campaign", wrong)  # not whole
+    wrong.write_text("[" * 100_000)
+    assert "not the campaign.json of `ppcbf campaign`" in refused(trained, "--campaign", wrong)
+    runs = ("campaign", "two_link", "circle", "--rollouts", 1, "--duration", 0.05, "--out", tmp_path / "c")
+    assert run(*runs, monkeypatch=monkeypatch) == 0
+    facts = json.loads((tmp_path / "c" / "campaign.json").read_text())
+    wrong.write_text(json.dumps(facts | {"robot": "panda", "obstacles": "sphere"}))
     assert "a campaign of 'panda' in 'sphere'" in refused(trained, "--campaign", wrong)
     assert "is not a barrier folder" in refused(tmp_path)
     (trained / "certificate.json").write_text("{}")

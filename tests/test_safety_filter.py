@@ -317,13 +317,66 @@ def without_velocity(moved):
     )
 
 
-@pytest.mark.parametrize("motion", [{"cat": Motion()}, {"ball": Motion(velocity=np.array([np.nan, 0.0, 0.0]))}])
+BAD_MOTIONS = {
+    "of no obstacle": {"cat": Motion()},
+    "not finite": {"ball": Motion(velocity=np.array([np.nan, 0.0, 0.0]))},
+    "lost by the tracker": {"ball": None},
+    "one number": {"ball": Motion(xyz=np.array([0.5]))},
+    "two numbers": {"ball": Motion(xyz=np.array([0.5, 0.0]))},
+    "no velocity": {"ball": Motion(velocity=None)},
+    "words": {"ball": Motion(xyz="here")},
+    "flat": {"ball": Motion(rotation=np.zeros((3, 3)))},
+    "stretched": {"ball": Motion(rotation=2.0 * np.eye(3))},
+    "mirrored": {"ball": Motion(rotation=np.diag([1.0, 1.0, -1.0]))},
+    "small": {"ball": Motion(rotation=np.eye(2))},
+    "a list": [("obstacle", Motion())],
+}
+
+
+@pytest.mark.parametrize("motion", BAD_MOTIONS.values(), ids=BAD_MOTIONS)
 def test_a_motion_that_cannot_be_used_is_a_fault(panda, motion):
     filter_ = SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf"))
     result = filter_.step(0.0, panda.robot.start, np.zeros(7), np.zeros(7), 0.0, motion)
     assert result.status is Status.FAULT
     assert np.all(np.abs(result.u) <= panda.model.u_max)
     assert "obstacle" in result.reason
+
+
+@pytest.mark.parametrize("d_p", ["x", [0.1, 0.2], np.array([0.1]), np.inf, 10**400, 1j])
+def test_a_dissipation_that_is_no_number_is_a_fault(two_link, d_p):
+    model, q = two_link.model, two_link.robot.start
+    filter_ = SafetyFilter(model, two_link.safety, two_link.barrier("lb-cbf"))
+    result = filter_.step(0.0, q, np.zeros(2), model.gravity(q), d_p)
+    assert result.status is Status.FAULT and np.all(np.abs(result.u) <= model.u_max)
+    assert filter_.step(0.001, q, np.zeros(2), model.gravity(q), np.array(0.1)).status is Status.FREE
+    assert filter_.step(10**400, q, np.zeros(2), model.gravity(q)).status is Status.INVALID
+
+
+def test_every_new_reason_of_an_alarm_is_logged_and_lasting_ones_once(two_link, caplog):
+    model, q = two_link.model, two_link.robot.start
+    filter_ = SafetyFilter(model, two_link.safety, two_link.barrier("lb-cbf"))
+    g, rest = model.gravity(q), np.zeros(2)
+    for i in range(3):
+        filter_.step(1e-3 * i, q, rest, [np.nan, 0.0])
+    for i in range(3, 6):
+        filter_.step(1e-3 * i, q, rest, g, motions={"cat": Motion()})
+    for i in range(3):
+        filter_.step(0.001 - 1e-4 * i, q, rest, g)  # backwards, by another number every time
+    filter_.reset()
+    filter_.step(0.0, q, rest, [np.nan, 0.0])
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert [" ".join(line.split()[:3]) for line in said] == [
+        "FAULT: u_des, d_p", "FAULT: no obstacle", "INVALID: time went", "FAULT: u_des, d_p"
+    ]  # fmt: skip
+
+
+def test_the_way_to_the_lb_barrier_and_back_is_logged(panda, make_barrier, caplog):
+    filter_ = SafetyFilter(panda.model, panda.safety, make_barrier(panda, "pp-ncbf-convex"))
+    q, v, g = panda.robot.start, np.zeros(7), panda.model.gravity(panda.robot.start)
+    for i, motions in enumerate((None, {"ball": Motion()}, {"ball": Motion()}, None)):
+        filter_.step(1e-3 * i, q, v, g, None, motions)
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert said == ["obstacles are elsewhere: K = 0 until they are back", "obstacles are back: K is, too"]
 
 
 def test_learned_terms_are_left_out_while_an_obstacle_moves(panda, make_barrier):

@@ -16,6 +16,7 @@ from scipy.stats import binom, kstest
 
 from ppcbf_robots.artefact import load_barrier, save_barrier
 from ppcbf_robots.band_statistics import clopper_pearson, count_violations, independent_band
+from ppcbf_robots.band_tasks import conditions
 from ppcbf_robots.certificate import NAME, Condition, overall
 from ppcbf_robots.cli.main import main
 from ppcbf_robots.evidence import uniform_band
@@ -139,9 +140,18 @@ def test_a_certificate_of_other_weights_is_ignored_with_a_sentence(folder, tmp_p
     assert "belongs to another barrier" in caplog.text and "ppcbf verify" in caplog.text
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"format": 1}', '{"format": 1, "conditions": {}, "verdict": "proved"}'])
+BROKEN = [
+    "", "[]", '{"format": 1}', '{"format": 1, "conditions": {}, "verdict": "proved"}', "[" * 100_000,
+    {"subject": []}, {"subject": None}, {"details": None}, {"details": {"power": "x"}},
+    {"conditions": {"passivity": 1}}, {"not_covered": 1}, {"seconds": "x"}, {"verdict": "certain"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("content", BROKEN, ids=lambda x: str(x)[:40])
 def test_a_broken_certificate_is_ignored_with_a_sentence(folder, tmp_path, caplog, content):
     path = copy(folder, tmp_path)
+    if isinstance(content, dict):  # a good one but for this
+        content = json.dumps(json.loads((path / NAME).read_text()) | content)
     (path / NAME).write_text(content)
     with caplog.at_level("WARNING"):
         assert load_barrier(path).certificate is None
@@ -170,6 +180,28 @@ def test_simulate_shows_the_certificate_and_what_it_is_not_about(folder, tmp_pat
     assert "for another goal, not for this run" in facts(*run, "--goal", "0.5,0.5")["certificate"]
     assert "for the qp filter" in facts(*run, "--metric", "torque")["certificate"]
     assert facts(*run[:3], *run[5:])["certificate"] is None
+
+
+def test_samples_of_a_barrier_that_was_there_before_do_not_count(folder, tmp_path, monkeypatch):
+    """The same weights with another gamma are another barrier, for which what is half done is no evidence."""
+    path, short = copy(folder, tmp_path), ("--method", "samples", "--samples", "100", "--seconds", "0", "--jobs", "1")
+    monkeypatch.setattr("ppcbf_robots.cli.verify.conditions", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert run_cli("verify", path, *short).code == 130
+    monkeypatch.undo()
+    half_done = (path / "verify.jsonl").read_text()
+    problem = load_problem("two_link", "circle")
+    drawn = []
+    monkeypatch.setattr(
+        "ppcbf_robots.cli.verify.conditions",
+        lambda stored, records, c: drawn.append(records) or conditions(stored, records, c),
+    )
+    facts("verify", path, *short)  # goes on: nothing is drawn again
+    save_barrier(path, problem.with_barrier_spec(BarrierSpec(gamma=3.0)), "pp-ncbf", "convex", no_network(problem),
+                 FilterConfig(), {})  # fmt: skip
+    (path / "verify.jsonl").write_text(half_done)
+    facts("verify", path, *short)
+    assert [json.loads(half_done)["key"]] == [r["key"] for r in drawn[0]]
+    assert json.loads(half_done)["key"] not in [r["key"] for r in drawn[1]]
 
 
 def test_a_proof_stops_in_time_and_says_what_is_open(folder, tmp_path):

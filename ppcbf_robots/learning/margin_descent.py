@@ -35,7 +35,9 @@ VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
 MIN_MARGIN, MAX_MARGIN = 0.02, 0.3
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
-ENOUGH = 300  # violating states that end the evidence's search
+HUNTING = 48  # starts of the search that goes along with training
+ENOUGH = 100  # violating states that end the evidence's search
+FEW = 100  # states of too little margin that end that of the LB-CBF before training
 RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
@@ -51,7 +53,7 @@ class MarginDescent(Descent):
         self._joints = problem.model.nv
         self._largest_margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
         self.margin = max(MIN_MARGIN, preset.first_margin * self._largest_margin)
-        self._hunt = self.falsifier.start()  # goes on from check to check
+        self._hunt = self.falsifier.start(HUNTING)  # goes on from check to check
         self._first_pool = len(self.rays)
         if self._violated_without_term() > MANY:
             self._begin_inside()
@@ -206,8 +208,9 @@ class MarginDescent(Descent):
             least = self.band.least_margin(tensors, self.rays_through(known.q, known.v))[0].cpu().numpy()
             if least.min() < 0.0:
                 return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
-        rounds = self.preset.attack_rounds * self._joints
-        return self.falsifier.search(tensors, rounds=rounds, enough=ENOUGH, below=RESERVE)
+        enough, enough_below = (ENOUGH, 0.0) if self.iteration else (FEW, RESERVE)
+        rounds = self.preset.attack_rounds * self._joints**2
+        return self.falsifier.search(tensors, rounds=rounds, enough=enough, below=RESERVE, enough_below=enough_below)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""

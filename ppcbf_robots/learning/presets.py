@@ -52,7 +52,7 @@ class Preset:
     refinement_rate: float = 0.0  # of the learning rate, with which each begins; at least the last one
     min_volume: float = 0.2  # of the LB set; less counts as collapsed
     test_samples: int = 5_000  # uniform band states of the evidence
-    attack_rounds: int = 0  # QP: of the falsifier in the evidence, per joint
+    attack_rounds: int = 0  # QP: of the falsifier in the evidence, times the square of the number of joints
     changes: tuple[str, ...] = field(default=())  # departures from the paper, shown to the user
 
 
@@ -103,7 +103,7 @@ DEFAULT = Preset(
     refinement_share=0.3,
     refinement_rate=0.4,
     test_samples=10_000,
-    attack_rounds=200,
+    attack_rounds=50,
 )
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}

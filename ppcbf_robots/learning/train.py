@@ -241,7 +241,7 @@ class Trainer:
                 check = self._draw_check(params, self.preset.test_samples)
             if check.samples:
                 tested.append(Tested(params, check, attack, volume))
-            if tested and tested[-1].clean:
+            if tested and tested[-1].stands:  # smaller ones can only be cleaner, which a refinement is better for
                 break
         return tested
 
