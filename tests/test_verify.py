@@ -19,11 +19,13 @@ from ppcbf_robots.band_statistics import clopper_pearson, count_violations, inde
 from ppcbf_robots.band_tasks import conditions
 from ppcbf_robots.certificate import NAME, Condition, overall
 from ppcbf_robots.cli.main import main
+from ppcbf_robots.cli.train import load_states
 from ppcbf_robots.evidence import uniform_band
-from ppcbf_robots.filters import FilterConfig
+from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning.falsifier import no_network
 from ppcbf_robots.learning.margin_descent import MarginDescent
 from ppcbf_robots.problem import load_problem
+from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import BarrierSpec
 
 
@@ -211,6 +213,37 @@ def test_a_proof_stops_in_time_and_says_what_is_open(folder, tmp_path):
     assert found["conditions"]["boundary_passivity"]["verdict"] == "proved"
     assert found["conditions"]["feasibility"]["verdict"] in ("undecided", "refuted")
     assert (path / "verify.npz").is_file()
+
+
+ONE_JOINT = """<robot name="one"><link name="base"/><link name="arm"><inertial><mass value="1"/>
+  <origin xyz="0.5 0 0"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+  <limit lower="-1.5" upper="1.5" effort="{effort}" velocity="2"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(("effort", "verdict", "code"), [(20, "proved", 0), (0.3, "refuted", 3)])
+def test_a_robot_of_one_joint_from_urdf_to_verdict(tmp_path, effort, verdict, code):
+    """Strong enough it is proved; too weak to brake it is refuted, with states that training can begin with."""
+    (tmp_path / "one.urdf").write_text(ONE_JOINT.format(effort=effort))
+    (tmp_path / "one.yaml").write_text(
+        "urdf: one.urdf\nbody:\n  - {frame: arm, center: [1, 0, 0], radius: 0.05}\n"
+        "controller: {type: bounded_spring, kp: 0.1, kd: 0.01, max_spring: 0.1}\n"
+    )
+    (tmp_path / "w.yaml").write_text("obstacles:\n  - {name: ball, type: sphere, center: [0, 1.2, 0], radius: 0.1}\n")
+    problem = load_problem(str(tmp_path / "one.yaml"), str(tmp_path / "w.yaml"))
+    save_barrier(tmp_path / "b", problem, "pp-ncbf", "convex", no_network(problem), FilterConfig(), {})
+    found = facts("verify", tmp_path / "b", "--jobs", "1", code=code)
+    assert (found["verdict"], found["method"]) == (verdict, "proof")
+    assert load_barrier(tmp_path / "b").certificate.verdict == verdict
+    states = tmp_path / "b" / "counterexamples.npz"
+    assert states.exists() == (code == 3)
+    if code:
+        q, v = load_states(states, problem.model)
+        dyn = problem.model.evaluate(q[0], v[0])
+        lb = problem.barrier("lb-cbf")
+        runtime = SafetyFilter(problem.model, problem.safety, lb)
+        nominal = problem.robot.controller.evaluate(dyn)
+        assert runtime.filter(dyn, nominal.u, float(nominal.d_p)).status >= Status.PASSIVITY_DROPPED
 
 
 def test_learning_takes_counterexamples_and_refuses_what_is_none(tmp_path, monkeypatch):

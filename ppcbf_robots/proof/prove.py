@@ -48,6 +48,7 @@ class Proof:
     def details(self) -> dict[str, Any]:
         """Counts for the certificate."""
         s = self.search
+        known = self.mass_error == 0.0 and np.isfinite(s.excess)  # looked at for the model, where rows leave a torque
         return {
             "boxes": s.judged,
             "boxes_proved": s.proved,
@@ -55,7 +56,7 @@ class Proof:
             "volume_without_passivity": s.impassive_volume,
             "volume_undecided": s.undecided_volume,
             "band_volume": self.band,
-            "largest_excess_power": s.excess if self.mass_error == 0.0 else None,  # looked at for the model alone
+            "largest_excess_power": s.excess if known else None,
             "mass_error": self.mass_error,
             "separating": self.separating,
             "rows": self.rows,
