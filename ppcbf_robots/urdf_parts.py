@@ -84,11 +84,11 @@ def _axis(path: Path, joint: Element, name: str) -> list[float]:
 
 
 def _force_limit(path: Path, joint: Element, name: str, what: str) -> float:
-    """Effort or velocity limit; 0, as URDFs write it, for none: missing, infinite or absurdly large."""
+    """Effort or velocity limit; 0, as URDFs write it, for none: missing, negative, infinite or absurdly large."""
     limit = joint.find("limit")
     text = None if limit is None else limit.get(what)
     value = 0.0 if text is None else number(path, text, f"joint '{name}', limit {what}", math.inf, infinite_ok=True)
-    return 0.0 if abs(value) >= UNSPECIFIED else value
+    return value if 0.0 < value < UNSPECIFIED else 0.0
 
 
 def _range(path: Path, joint: Element, name: str) -> tuple[float, float]:

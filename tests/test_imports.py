@@ -56,7 +56,7 @@ OWNERS = {
     "hj_reachability": ["viability"],
     "jax": ["viability"],
     "casadi": ["symbolic", "nmpc", "proof"],
-    "pydantic": ["specs", "world"],
+    "pydantic": ["specs", "world", "certificate", "report"],
     "yaml": ["specs"],
     "typer": ["cli"],
     "torch": ["learning", "export", "studies", "cli", "band_tasks"],

@@ -355,11 +355,13 @@ def test_triangles_are_counted_before_loading(tmp_path):
     binary = bytes(80) + (3).to_bytes(4, "little") + bytes(150)
     polylist = b"<mesh><triangles material='a' count=\"7\"></triangles><polylist count='5'/></mesh>"
     for suffix, content, count in ((".stl", TETRAHEDRON.encode(), 4), (".stl", binary, 3),
-                                   (".obj", b"v 0 0 0\nf 1 2 3\nf 1 2 3\n", 2), (".dae", polylist, 12),
-                                   (".ply", b"ply\nelement vertex 9\nelement face 4\n", 9)):  # fmt: skip
+                                   (".obj", b"v 0 0 0\nf 1 2 3\nf 1 2 3\n", 2), (".dae", polylist, 12)):  # fmt: skip
         assert count_triangles(suffix, content) == count
-    many = tmp_path / "many.ply"
-    many.write_bytes(b"ply\nelement vertex 999999999999\n")
+    many = tmp_path / "many.dae"
+    many.write_bytes(b"<mesh><triangles count='999999999999'/></mesh>")
     assert mesh_problem(many) == f"has 999999999999 triangles, more than {MAX_TRIANGLES}; simplify it"
+    many.write_bytes(b"<c:node/>" * 1001)
+    assert mesh_problem(many) == "has 1001 nodes, more than 1000; merge them"
+    assert "unknown format" in mesh_problem(tmp_path / "a.ply")  # its reader takes faces of vertices that are not there
     assert "unknown format" in mesh_problem(tmp_path / "a.blend")
     assert find_mesh("a" * 5000, tmp_path / "arm.urdf", []) is None

@@ -115,22 +115,28 @@ class Falsifier:
         enough: float = float("inf"),
         below: float = 0.0,
         enough_below: float = 0.0,
+        linger: float = float("inf"),
     ) -> Attack:
         """Descend until rounds or seconds are used up, or ``enough`` states were found with less than ``enough_below``.
 
-        States of a margin less than ``below`` come back.
+        It also ends ``linger`` rounds after the first of these. States of a margin less than ``below`` come back.
 
         ``starts`` of an earlier search, with other parameters or not, go on and are changed in place.
         """
-        began, done, found = time.monotonic(), 0, _Found(below, enough_below)
+        began, done, first, found = time.monotonic(), 0, 1, _Found(below, enough_below)
         if starts is None:
             starts = self.start()
         known = starts.step > 0.0
         starts.value[known] = found.add(*self.margins(params, starts.points[known]))
         self._replace(params, starts, ~known, found)
-        while (rounds is None or done < rounds) and time.monotonic() - began < seconds and found.states < enough:
+        last = float("inf") if rounds is None else rounds
+        while done < last and time.monotonic() - began < seconds and found.states < enough:
             self._descend(params, starts, found)
             done += 1
+            if found.states:
+                last = min(last, first + linger)
+            else:
+                first = done + 1
             over = starts.step < LAST_STEP
             if done % CULLING == 0:
                 old = np.flatnonzero(starts.age >= CULLING)

@@ -37,6 +37,7 @@ SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 HUNTING = 48  # starts of the search that goes along with training
 ENOUGH = 100  # violating states that end the evidence's search
+LINGER = 0.15  # of its rounds, that it goes on after the first of them
 FEW = 100  # states of too little margin that end that of the LB-CBF before training
 RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
@@ -208,9 +209,11 @@ class MarginDescent(Descent):
             least = self.band.least_margin(tensors, self.rays_through(known.q, known.v))[0].cpu().numpy()
             if least.min() < 0.0:
                 return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
-        enough, enough_below = (ENOUGH, 0.0) if self.iteration else (FEW, RESERVE)
         rounds = self.preset.attack_rounds * self._joints**2
-        return self.falsifier.search(tensors, rounds=rounds, enough=enough, below=RESERVE, enough_below=enough_below)
+        enough, enough_below = (ENOUGH, 0.0) if self.iteration else (FEW, RESERVE)
+        return self.falsifier.search(
+            tensors, rounds, enough=enough, below=RESERVE, enough_below=enough_below, linger=LINGER * rounds
+        )
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""

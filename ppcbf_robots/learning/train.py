@@ -167,12 +167,16 @@ class Trainer:
                 found = self._evidence()
             except KeyboardInterrupt:
                 found, interrupted = [], True
-            tested = sorted([*tested, *found], key=lambda t: (t.violates, not t.clean, t.failures, -t.volume_kept))
+            if round_ < 0:  # where the LB-CBF is not clean, its search was cut short
+                tested = [t for t in found if t.clean]
+            else:
+                tested += found
+            tested = sorted(tested, key=lambda t: (t.violates, not t.clean, t.failures, -t.volume_kept))
             out_of_time = time.monotonic() - self.started > time_limit
             enough = bool(tested) and (tested[0].clean or (round_ >= RESERVE_ROUNDS and tested[0].stands))
             gained += enough
-            larger = any(t.volume_kept > tested[0].volume_kept for t in found)  # that did not stand
-            last = round_ == self.preset.refinements or (enough and (gained > GAIN_ROUNDS or not larger))
+            larger = enough and any(t.volume_kept > tested[0].volume_kept for t in found)  # that did not stand
+            last = round_ == self.preset.refinements or (enough and not (larger and gained <= GAIN_ROUNDS))
             if last or interrupted or out_of_time:
                 break
             if round_ < 0:

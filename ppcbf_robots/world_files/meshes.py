@@ -9,12 +9,12 @@ import coal
 import numpy as np
 
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.meshes import mesh_problem
 from ppcbf_robots.resources import default_package_dirs
 from ppcbf_robots.specs import Array
 from ppcbf_robots.world_shapes import convex
 
 MESH_SUFFIXES = (".stl", ".obj", ".dae")
-MAX_MESH_BYTES = 100_000_000
 MAX_POINTS = 500_000  # of a mesh as given
 MAX_HULL = 2_000  # vertices of a hull; distances to more would not keep up with a control loop
 
@@ -34,9 +34,9 @@ def mesh_hull(resource: str, scale: Sequence[float], world: Path, where: str) ->
     path = _find(resource, world, where)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{where}: mesh '{resource}': meshes are read from {', '.join(MESH_SUFFIXES)} files")
+    if problem := mesh_problem(path):
+        raise InputError(f"{where}: mesh '{resource}' {problem}")
     try:
-        if path.stat().st_size > MAX_MESH_BYTES:
-            raise InputError(f"{where}: mesh '{resource}': larger than {MAX_MESH_BYTES // 10**6} MB; simplify it")
         points = np.array(coal.MeshLoader().load(str(path), np.asarray(scale, float)).vertices(), dtype=float)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{where}: mesh '{resource}' cannot be read ({_reason(error)})") from None
