@@ -26,7 +26,9 @@ def bench(
     obstacles: Annotated[str | None, typer.Argument(metavar="[OBSTACLES]", help="Time this world alone.")] = None,
     barrier: Annotated[str, typer.Option(help="With OBSTACLES: barrier folder, lb-cbf or pp-cbf.")] = "lb-cbf",
     steps: Annotated[int, typer.Option(min=100, help="Steps per case.")] = 10_000,
-    pairs: Annotated[list[int] | None, typer.Option(min=1, help="Pairs with the body; give it once per case.")] = None,
+    pairs: Annotated[
+        list[int] | None, typer.Option(min=1, max=20_000, help="Pairs with the body; give it once per case.")
+    ] = None,
     figure: Annotated[Path | None, typer.Option(help="Write the growth with pairs and joints as a picture.")] = None,
     json: JsonOption = False,
 ) -> None:

@@ -16,6 +16,7 @@ from ppcbf_robots.shapes import smoothing_gap
 
 STATES = 2_000
 BAND_STATES = 1_000
+MANY_PLANES = 500  # of a convex mesh, with which a step takes twice as long
 
 
 def info(
@@ -50,6 +51,9 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
             f"u_des leaves the torque box on {outside:.1%} of X, most at '{joint}': "
             "there the filter must change it even without an obstacle, and the closed form exceeds the box"
         )
+    for name, turns, (low, high) in zip(model.joint_names, model.continuous, robot.domain.q, strict=True):
+        if turns and high - low < 2.0 * np.pi - 1e-6:
+            warnings.append(f"joint '{name}' turns freely: nothing keeps it in the range {low:g} .. {high:g} of X")
     slow = too_fast_for_rate(model, robot.spec.barrier.gamma)
     warnings += [slow] if slow else []
     facts: dict[str, Any] = {
@@ -84,6 +88,12 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
                   "start_clearance": h, "start_nearest": row}  # fmt: skip
         if h < 0.0:
             warnings.append(f"the start configuration violates '{row}' by {-h:.4f}; give another with --start")
+        for name, planes in zip(problem.safety.packed.names, np.diff(problem.safety.packed.plane_start), strict=True):
+            if planes > MANY_PLANES:
+                warnings.append(
+                    f"obstacle '{name}' has {planes} supporting planes, and every body sphere is held against each of "
+                    "them in every step: simplify the mesh"
+                )
         goal_h, goal_row = problem.safety.least(robot.goal)
         if goal_h < 0.0:
             warnings.append(f"the goal violates '{goal_row}' by {-goal_h:.4f}: the arm will rest before it")

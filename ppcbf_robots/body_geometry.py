@@ -75,12 +75,13 @@ def pieces_of(shapes: Iterable[pin.GeometryObject], frame: pin.SE3 | None = None
         UnknownShapeError: for a shape without triangles that is no box, sphere, cylinder or capsule.
     """
     objects = list(shapes)
-    spacing = max([SPACING, *(SPACING_SHARE * _longest(o.geometry) for o in objects)])
+    spacing = max([SPACING, *(SPACING_SHARE * longest(o.geometry) for o in objects)])
     frame = pin.SE3.Identity() if frame is None else frame
     return _joined([_placed(_pieces(o.geometry, spacing), frame.actInv(o.placement)) for o in objects])
 
 
-def _longest(shape: coal.CollisionGeometry) -> float:
+def longest(shape: coal.CollisionGeometry) -> float:
+    """Longest edge [m] of a shape's bounding box in its own frame."""
     shape.computeLocalAABB()
     return float((shape.aabb_local.max_ - shape.aabb_local.min_).max())
 

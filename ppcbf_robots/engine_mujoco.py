@@ -196,7 +196,7 @@ def _add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: _Placed, robot: b
     geom = body.add_geom(name=name, type=part.shape.kind, pos=part.xyz, quat=_quaternion(part.rotation))
     geom.contype, geom.conaffinity = (1, 0) if robot else (0, 1)
     if part.shape.points is None:
-        geom.size[: len(part.shape.size)] = part.shape.size
+        geom.size[: len(part.shape.size)] = np.maximum(part.shape.size, 0.5 * _THIN)
     else:
         convex = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         spec.add_mesh(name=name, uservert=part.shape.points.ravel(), inertia=convex)

@@ -15,6 +15,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from ppcbf_robots.body_geometry import longest
 from ppcbf_robots.joints import lock
 from ppcbf_robots.resources import is_file
 from ppcbf_robots.specs import Array
@@ -22,6 +23,7 @@ from ppcbf_robots.specs import Array
 MAX_BYTES = 50_000_000
 MAX_TRIANGLES = 200_000  # five seconds of reading
 MAX_NODES = 1000  # of a Collada scene; its reader recurses into them and runs out of stack
+NEGLIGIBLE = 1e-4  # [m], length of a shape that counts as none
 MAX_SIZE = 100.0  # [m], of a scaled mesh
 FORMATS = (".stl", ".dae", ".obj")  # the reader of PLY crashes on faces of vertices that are not there
 
@@ -51,6 +53,8 @@ class Meshes:
         xml = tostring(root, encoding="unicode")
         full = pin.buildGeomFromUrdfString(full_model, xml, kind, None, [], self.loader)
         model, (shapes,) = lock(full_model, locked, [full])
+        for name in [o.name for o in shapes.geometryObjects if longest(o.geometry) < NEGLIGIBLE]:
+            shapes.removeGeometryObject(name)  # dummy links have such, to please a parser
         if kind == pin.GeometryType.COLLISION:
             joints = {model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint for link in wrong}
             for name in [o.name for o in shapes.geometryObjects if o.parentJoint in joints]:

@@ -160,7 +160,7 @@ def load_robot(name: str) -> Robot:
     pairs, q_start = [], model.from_angles(start)
     if spec.self_collision is not None:
         srdf = spec.self_collision.srdf
-        pairs = self_pairs(model, body, q_start, None if srdf is None else path.parent / srdf)
+        pairs = self_pairs(model, body, q_start, None if srdf is None else path.parent / srdf, fitted=spec.body is None)
     return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, cover)
 
 

@@ -46,6 +46,8 @@ def find_robot(name: str) -> Path:
     example = find_example(name)
     if example is not None:
         return example
+    if is_file(path):
+        raise InputError(f"{path}: a robot is a .urdf, .xml, .yaml or .yml file, or by xacro made into one")
     raise InputError(
         f"no robot named '{name}': give a URDF or YAML path, a bundled name ({', '.join(specs)}), "
         "or the name of a URDF in example-robot-data, such as ur5, z1 or xarm7"

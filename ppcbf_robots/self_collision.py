@@ -3,30 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, BodySphere
 from ppcbf_robots.urdf import parse_xml
 
 
-def self_pairs(robot: RobotModel, body: Sequence[BodySphere], start: Array, srdf: Path | None) -> list[tuple[int, int]]:
+def self_pairs(
+    robot: RobotModel, body: Sequence[BodySphere], start: Array, srdf: Path | None, fitted: bool
+) -> list[tuple[int, int]]:
     """Pairs (i, j) of body spheres that become rows.
 
     Left out are spheres of one joint or of a joint and its parent, links whose collision the SRDF disables, and pairs
     that overlap already in ``start`` (nq,): there the spheres are coarser than the links, and no torque parts them.
+    A fitted sphere covers any of the links that its joint carries: a pair is left out where all of theirs are disabled.
     """
     points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
     joints, parents = points.joints, list(robot.model.parents)
     disabled = set() if srdf is None else disabled_links(srdf)
+    _warn_of_strangers(robot, srdf, disabled)
+    carried = _carried(robot) if fitted else {}
+    links = [carried.get(int(j), {s.frame}) for s, j in zip(body, joints, strict=True)]
     p = points.kinematics(robot.evaluate(start, np.zeros(robot.nv))).p
     found, touching = [], 0
     for i, j in combinations(range(len(body)), 2):
         a, b = int(joints[i]), int(joints[j])
-        if a == b or parents[a] == b or parents[b] == a or frozenset((body[i].frame, body[j].frame)) in disabled:
+        if a == b or parents[a] == b or parents[b] == a:
+            continue
+        if all(frozenset(pair) in disabled for pair in product(links[i], links[j])):
             continue
         if np.linalg.norm(p[i] - p[j]) <= body[i].radius + body[j].radius:
             touching += 1
@@ -35,6 +44,23 @@ def self_pairs(robot: RobotModel, body: Sequence[BodySphere], start: Array, srdf
     if touching:
         robot.warnings.append(f"self-collision: {touching} pairs of body spheres overlap at the start and are left out")
     return found
+
+
+def _carried(robot: RobotModel) -> dict[int, set[str]]:
+    """Links with collision geometry by the joint that moves them."""
+    found: dict[int, set[str]] = {}
+    for o in robot.geometry(pin.GeometryType.COLLISION).geometryObjects:
+        found.setdefault(int(o.parentJoint), set()).add(robot.model.frames[o.parentFrame].name)
+    return found
+
+
+def _warn_of_strangers(robot: RobotModel, srdf: Path | None, disabled: set[frozenset[str]]) -> None:
+    """An SRDF that does not fit the robot would leave out other pairs than its author meant."""
+    strangers = sorted({link for pair in disabled for link in pair if not robot.model.existFrame(link)})
+    if srdf is not None and not disabled:
+        robot.warnings.append(f"{srdf}: disables no pair of links; is it the SRDF of this robot?")
+    if strangers:
+        robot.warnings.append(f"{srdf}: the robot has no link named {', '.join(strangers[:5])}; is it its SRDF?")
 
 
 def disabled_links(srdf: Path) -> set[frozenset[str]]:

@@ -168,6 +168,8 @@ MAX_SPEC_BYTES = 4_000_000
 def read_text(path: Path, what: str) -> str:
     """Text of a file, or an :class:`InputError` that says why not."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path} is a pipe or a device; give the path of a {what}")
         if path.stat().st_size > MAX_SPEC_BYTES * 10:
             raise InputError(f"{path}: larger than {MAX_SPEC_BYTES * 10 // 10**6} MB, which no {what} is")
         return path.read_text(encoding="utf-8")
@@ -196,13 +198,16 @@ def read_mapping(path: Path, what: str, keys: Sequence[str]) -> dict[str, Any]:
     if len(text) > MAX_SPEC_BYTES:
         raise InputError(f"{path}: larger than {MAX_SPEC_BYTES // 10**6} MB, which no {what} is")
     try:
-        data = yaml.load(text, Loader=_Loader)
+        documents = [x for x in yaml.load_all(text, Loader=_Loader) if x is not None]  # ROS ends one with ---
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "unknown line"
         raise InputError(f"{path}: not valid YAML at {where}: {error.problem}") from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if len(documents) > 1:
+        raise InputError(f"{path}: holds {len(documents)} YAML documents; keep one")
+    data = documents[0] if documents else None
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected a mapping with keys such as {', '.join(keys)}")
     return data

@@ -13,6 +13,7 @@ Solid = Sphere | Box | Capsule | Cylinder | ConvexMesh  # every obstacle that en
 
 FLAT = 1e-5  # least over largest width of a mesh; qhull crashes the process on flatter ones
 MIN_WIDTH = 1e-6  # [m]
+FARTHEST = 1e4  # [m]; farther than any arm reaches
 _RING = 48  # points around an axis
 
 
@@ -63,6 +64,9 @@ def convex(points: Array, where: str) -> tuple[coal.Convex, Array]:
     """
     if not np.all(np.isfinite(points)):
         raise InputError(f"{where}: a vertex of the mesh is not finite")
+    size = float(np.abs(points).max(initial=0.0))
+    if size > FARTHEST:  # qhull crashes the process on very large numbers
+        raise InputError(f"{where}: the mesh reaches {size:.3g} m from its origin; check its scale")
     points = np.unique(points, axis=0)
     if len(points) < 4:
         raise InputError(f"{where}: a solid needs at least 4 different vertices, this mesh has {len(points)}")

@@ -16,7 +16,8 @@ from scipy.spatial import ConvexHull
 from ppcbf_robots import body_cache, body_fit, derive_body
 from ppcbf_robots.body import body_spheres
 from ppcbf_robots.body_geometry import UnknownShapeError, pieces_of
-from ppcbf_robots.problem import Robot, load_robot
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.problem import Robot, load_problem, load_robot
 from ppcbf_robots.specs import Array, BodyPrimitive, BodySphere
 
 PANDA = "urdf: panda\nlocked: {panda_finger_joint1: 0.02, panda_finger_joint2: 0.02}\n"
@@ -331,6 +332,35 @@ def test_visual_geometry_is_covered_where_there_is_no_other(tmp_path):
     ]
     centers, radii = balls_in_joint(robot, links(robot)[2].moving)
     assert gap(np.array([[0.05, 0.025, 0.3], [-0.05, -0.025, 0.0]]), centers, radii) <= 1e-9
+
+
+@pytest.mark.parametrize(
+    "nothing", ['<box size="0 0 0"/>', '<sphere radius="0"/>', '<cylinder radius="1e-6" length="1e-5"/>',
+                '<mesh filename="t.obj" scale="0 0 0"/>', '<mesh filename="t.obj" scale="1e-9 1e-9 1e-9"/>']
+)  # fmt: skip
+@pytest.mark.parametrize("kind", ["collision", "visual"])
+def test_a_dummy_shape_counts_as_none(tmp_path, nothing, kind):
+    (tmp_path / "t.obj").write_text(TETRAHEDRON.format(1))
+    robot = load_robot(urdf(tmp_path, box(0.1, 0.1, 0.3), f"<geometry>{nothing}</geometry>", kind))
+    assert {s.frame for s in robot.body} == {"upper", "fore"}
+    assert any("no geometry can be read at link 'fore': body spheres stand along it" in w for w in robot.model.warnings)
+
+
+def test_flat_shapes_are_covered_and_touch_in_mujoco(tmp_path):
+    mujoco = pytest.importorskip("ppcbf_robots.engine_mujoco")
+    disc = '<geometry><cylinder radius="0.1" length="0"/></geometry>'
+    robot = urdf(tmp_path, box(0.1, 0.1, 0.0), disc)
+    problem = load_problem(robot, "sphere")
+    assert {s.frame for s in problem.robot.body} == {"upper", "fore"}
+    engine = mujoco.MujocoEngine(problem)
+    engine.reset(problem.robot.start, np.zeros(2))
+    engine.advance(np.zeros(2), 1e-3, 10)
+    assert np.all(np.isfinite(engine.state()[0]))
+
+
+def test_a_capsule_in_millimetres_is_refused():
+    with pytest.raises(InputError, match=r"capsule at 'b' of 300 m and a radius of 0\.02 m .* lengths are metres"):
+        body_spheres([BodyPrimitive(frame="b", to=[300.0, 0.0, 0.0], radius=0.02)])
 
 
 def test_without_readable_geometry_spheres_stand_along_the_links(tmp_path):

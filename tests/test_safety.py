@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.problem import load_problem
+from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.safety import SafetyFunction
 from ppcbf_robots.shapes import Motion, Packed, pack, smoothing_gap
 from ppcbf_robots.specs import Array, BodySphere
@@ -271,7 +271,7 @@ def test_motion_of_an_unknown_obstacle_and_nan_are_refused(panda):
     assert str(error.value) == "no obstacle is named 'cat' (obstacles: ball)"
     with pytest.raises(InputError) as error:
         panda.safety.packed.moved({"ball": Motion(velocity=np.array([np.nan, 0, 0]))})
-    assert str(error.value) == "obstacle 'ball': its position and motion must be finite numbers"
+    assert str(error.value) == "obstacle 'ball': velocity must be finite numbers of shape (3,)"
 
 
 def test_moving_leaves_the_world_as_it_is(panda):
@@ -313,6 +313,9 @@ def test_a_domain_tighter_than_the_limits_gives_rows(two_link):
 
 SRDF = """<robot name="panda">
   <disable_collisions link1="panda_link7" link2="panda_link3" reason="Never"/>
+  <disable_collisions link1="panda_link3" link2="panda_hand" reason="Never"/>
+  <disable_collisions link1="panda_link3" link2="panda_leftfinger" reason="Never"/>
+  <disable_collisions link1="panda_link3" link2="panda_rightfinger" reason="Never"/>
 </robot>"""
 
 
@@ -337,3 +340,27 @@ def test_self_collision_on_request(tmp_path):
     assert everything.fingerprint()["robot"] != some.fingerprint()["robot"]
     with pytest.raises(InputError, match="SRDF not found"):
         load_problem(str(tmp_path / "none.yaml"), "sphere")
+
+
+def test_an_srdf_and_fitted_spheres_that_cover_several_links(tmp_path):
+    """The spheres of joint 7 cover link7 and the hand: they are left out where both are disabled, and not before."""
+    plain = "urdf: panda\nlocked: {panda_finger_joint1: 0.02, panda_finger_joint2: 0.02}\nself_collision: "
+    links = ["panda_link7", "panda_hand", "panda_leftfinger", "panda_rightfinger"]
+
+    def load(name: str, disabled: list[str]) -> Problem:
+        lines = [f'<disable_collisions link1="panda_link5" link2="{link}" reason="Never"/>' for link in disabled]
+        (tmp_path / f"{name}.srdf").write_text(f'<robot name="panda">{"".join(lines)}</robot>')
+        (tmp_path / f"{name}.yaml").write_text(f"{plain}{{srdf: {name}.srdf}}\n")
+        return load_problem(str(tmp_path / f"{name}.yaml"), "sphere")
+
+    (tmp_path / "all.yaml").write_text(plain + "{}\n")
+    everything = load_problem(str(tmp_path / "all.yaml"), "sphere")
+    half, whole = load("half", links[:1]), load("whole", links)
+    assert half.robot.self_pairs == everything.robot.self_pairs
+    gone = set(everything.robot.self_pairs) - set(whole.robot.self_pairs)
+    assert gone and {frozenset(everything.robot.body[i].frame for i in pair) for pair in gone} == {
+        frozenset(("panda_link5", "panda_link7"))
+    }
+    empty, foreign = load("empty", []), load("foreign", ["panda_foot"])
+    assert any("disables no pair of links" in w for w in empty.model.warnings)
+    assert any("the robot has no link named panda_foot" in w for w in foreign.model.warnings)

@@ -346,6 +346,8 @@ def test_aliases_that_multiply_are_refused_at_once(tmp_path):
 
 
 def test_missing_files_and_unknown_names(tmp_path):
+    (tmp_path / "ARM.URDF").write_text("<robot/>")
+    assert message(load_robot, str(tmp_path / "ARM.URDF")).startswith(f"{tmp_path / 'ARM.URDF'}: a robot is a .urdf")
     assert message(load_robot, "nope.yaml") == "robot file not found: nope.yaml"
     assert message(load_robot, "nope.urdf") == "robot file not found: nope.urdf"
     assert message(load_robot, "nope") == (

@@ -182,6 +182,9 @@ def chain(links: int, moving: int) -> str:
 DEEP = "<x>" * 200_000 + "</x>" * 200_000
 NODES = '<COLLADA><library_visual_scenes><visual_scene id="s">' + '<node id="n">' * 100_000
 NODES += "</node>" * 100_000 + "</visual_scene></library_visual_scenes></COLLADA>"
+PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+PLY += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+PLY += "0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1000000\n"
 CRASHERS = {
     "20,000 links": (chain(20_000, 3), "20000 links; at most 1000 are read"),
     "1,000 moving joints": (chain(1000, 999), "999 joints move, at most 8 can; write a robot spec with this `urdf` "),
@@ -196,6 +199,7 @@ CRASHERS = {
     "a pipe for a mesh": (ARM.replace("fore.stl", "pipe.stl"), None),
     "a huge mesh": (ARM.replace("fore.stl", "huge.stl"), None),
     "a mesh of noise": (ARM.replace("fore.stl", "noise.dae"), None),
+    "a mesh of faces without vertices": (ARM.replace("fore.stl", "bad.ply"), None),
     "a mesh that is a folder": (ARM.replace("fore.stl", "folder.stl"), None),
 }
 RUN = """
@@ -212,6 +216,7 @@ for path in sys.argv[2:]:
 def test_what_might_crash_the_interpreter(tmp_path):
     for name, content in (("nodes.dae", NODES), ("noise.dae", "<COLLADA>\x01\x02"), ("fore.stl", TETRAHEDRON)):
         (tmp_path / name).write_text(content)
+    (tmp_path / "bad.ply").write_text(PLY)
     os.mkfifo(tmp_path / "pipe.stl")
     (tmp_path / "folder.stl").mkdir()
     with (tmp_path / "huge.stl").open("wb") as file:
@@ -227,6 +232,7 @@ def test_what_might_crash_the_interpreter(tmp_path):
     for (name, (_, refusal)), path in zip(CRASHERS.items(), paths, strict=True):
         assert said[name].startswith("model; " if refusal is None else f"{path}: {refusal}"), said[name]
     assert "'nodes.dae' has 100000 nodes, more than 1000; merge them" in said["nested Collada nodes"]
+    assert "'bad.ply' has an unknown format" in said["a mesh of faces without vertices"]
     assert "'huge.stl' is larger than 50 MB; simplify it" in said["a huge mesh"]
     assert "'noise.dae' cannot be read" in said["a mesh of noise"]
     for name in ("a pipe for a mesh", "a mesh that is a folder", "a device for a mesh"):

@@ -5,7 +5,10 @@ from __future__ import annotations
 import itertools
 import json
 import logging
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from ppcbf_robots.resources import find_world
 from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Obstacle, Sphere
 from ppcbf_robots.world_files import meshes
 from ppcbf_robots.world_files.load import load_world, read_world
+from ppcbf_robots.world_files.write import write_world
 from ppcbf_robots.world_shapes import coal_shape, surface_points
 
 DATA = Path(__file__).parent / "data" / "worlds"
@@ -289,6 +293,12 @@ CHANGES = [
     ("moveit_new.scene", "0 0 0.70710678 0.70710678", "0 0 0.7 0.1",
      "line 4: the quaternion must have length 1, got 0.7071"),
     ("moveit_new.scene", "front\n", "", "line 19: expected a subframe's pose, got '*'"),
+    ("motion_bench_maker.yaml", "frame_id: base_link\n      id: Can1", "frame_id: camera_base_link\n      id: Can1",
+     "object 'Can1': its frame 'camera_base_link' is not known; give it in the robot's base frame, or write "
+     "base_link where the two are the same"),
+    ("motion_bench_maker.yaml", "frame_id: base_link\n      id: Can1", "frame_id: gripper_base\n      id: Can1",
+     "object 'Can1': its frame 'gripper_base' is not known; give it in the robot's base frame, or write "
+     "base_link where the two are the same"),
     ("motion_bench_maker.yaml", "frame_id: base_link\n      id: Can1", "frame_id: camera\n      id: Can1",
      "object 'Can1': its frame 'camera' is not known; give it in the robot's base frame, or write base_link where the "
      "two are the same"),
@@ -455,8 +465,64 @@ def test_meshes_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert said("good.stl") == "mesh 'good.stl': its convex hull has 4 vertices; at most 3 are taken, simplify it"
     monkeypatch.setattr(meshes, "MAX_POINTS", 3)
     assert said("good.stl") == "mesh 'good.stl': 4 vertices; at most 3 are read, simplify the mesh"
-    monkeypatch.setattr(meshes, "MAX_MESH_BYTES", 10)
-    assert said("good.stl") == "mesh 'good.stl': larger than 0 MB; simplify it"
+    monkeypatch.setattr("ppcbf_robots.meshes.MAX_BYTES", 10)
+    assert said("good.stl") == "mesh 'good.stl' is larger than 0 MB; simplify it"
+
+
+CRASHERS = {
+    "{file: nodes.dae}": "mesh 'nodes.dae' has 100000 nodes, more than 1000; merge them",
+    "{vertices: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], scale: 1.0e+77}": "reaches 1e+77 m from its origin",
+    "{vertices: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], scale: 1.0e+300}": "reaches 1e+300 m from its origin",
+}  # each ended the interpreter once
+RUN = """
+import sys
+from pathlib import Path
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.world_files.load import load_world
+for path in sys.argv[1:]:
+    try:
+        print(load_world(Path(path)), flush=True)
+    except InputError as error:
+        print(error, flush=True)
+"""
+
+
+def test_meshes_that_might_crash_the_interpreter(tmp_path: Path) -> None:
+    node = '<node id="n">' * 100_000 + "</node>" * 100_000
+    scene = f'<library_visual_scenes><visual_scene id="s">{node}</visual_scene></library_visual_scenes>'
+    (tmp_path / "nodes.dae").write_text(f"<COLLADA>{scene}</COLLADA>")
+    paths = [tmp_path / f"world{i}.yaml" for i in range(len(CRASHERS))]
+    for path, fields in zip(paths, CRASHERS, strict=True):
+        path.write_text(f"obstacles:\n  - {{name: m, type: mesh, {fields[1:]}\n")
+    done = subprocess.run([sys.executable, "-c", RUN, *map(str, paths)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, (done.stdout[-300:], done.stderr[-300:])
+    for line, expected in zip(done.stdout.splitlines(), CRASHERS.values(), strict=True):
+        assert expected in line
+
+
+def test_what_ros2_prints_is_a_world(tmp_path: Path) -> None:
+    """An operation printed as a byte, and a document that ends with ---; a frame that only sounds right is named."""
+    path = tmp_path / "scene.yaml"
+    item = '{header: {frame_id: panda_link0}, id: a, operation: "\\0", primitives: [{type: 2, dimensions: [0.1]}], '
+    item += "primitive_poses: [{position: [1, 0, 0], orientation: [0, 0, 0, 1]}]}"
+    path.write_text(f"world: {{collision_objects: [{item}]}}\n---\n")
+    read = read_world(path)
+    assert read.world.obstacles[0].name == "a"
+    assert read.notes == ["frame 'panda_link0' is taken to be the robot's base"]
+    path.write_text(f"world: {{collision_objects: [{item}]}}\n---\nworld: {{}}\n")
+    assert refusal(path) == "holds 2 YAML documents; keep one"
+    path.write_text(f"world: {{collision_objects: [{item}]}}\noctomap: {{octomap: {{data: [1]}}}}\n")
+    assert "octomaps cannot be represented" in refusal(path)
+
+
+def test_places_where_no_world_can_be_written(tmp_path: Path) -> None:
+    world = load_world(DATA / "cell.urdf")
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for path, said in ((tmp_path / "pipe.yaml", "is not a file"), (tmp_path / ("a" * 300), "File name too long")):
+        with pytest.raises(InputError, match=said):
+            write_world(world, path, "t", overwrite=True)
+    with pytest.raises(InputError, match="is a pipe or a device"):
+        read_world(tmp_path / "pipe.yaml")
 
 
 # Damaged files

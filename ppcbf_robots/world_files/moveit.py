@@ -33,6 +33,9 @@ PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}  # of shape_msgs/
 DIMENSIONS = {"box": 3, "sphere": 1, "cylinder": 2, "cone": 2}
 BASE_FRAMES = ("", "world", "base", "base_link", "root", "root_link", "link0", "link_0")
 BASE_ENDINGS = ("_base", "_base_link", "_link0", "_link_0")  # such as panda_link0
+CARRIED = {"camera", "ee", "eef", "finger", "flange", "gripper", "hand", "head", "lidar", "mobile", "sensor", "tool",
+           "torso", "wrist"}  # fmt: skip
+ADDED = (None, 0, "0", "add", "ADD", "\0", b"\0")  # ROS 2 prints a byte
 
 
 def read_moveit(scene: Scene, data: dict[str, Any]) -> None:
@@ -69,7 +72,7 @@ def _refuse_the_rest(scene: Scene, data: dict[str, Any], world: dict[str, Any]) 
     state = data.get("robot_state")
     if isinstance(state, dict) and state.get("attached_collision_objects"):
         raise InputError(f"{scene.at('robot_state')}: attached objects move with the robot; give it body spheres there")
-    if _has_octomap(world.get("octomap")):
+    if any(_has_octomap(x.get("octomap")) for x in (data, world)):
         raise InputError(f"{scene.at('octomap')}: octomaps cannot be represented; give shapes or meshes")
     _refuse_other_frames(scene, data.get("fixed_frame_transforms") or [])
     for key in ("link_padding", "link_scale"):
@@ -103,16 +106,20 @@ def _frame(scene: Scene, where: str, fields: dict[str, Any]) -> str:
     header = fields.get("header")
     frame = header.get("frame_id") if isinstance(header, dict) else None
     name = "" if frame is None else str(frame).strip("/")
-    if name not in BASE_FRAMES and not name.endswith(BASE_ENDINGS):
+    known = name.endswith(BASE_ENDINGS) and not CARRIED & set(name.lower().split("_"))
+    if name not in BASE_FRAMES and not known:
         raise InputError(
             f"{scene.at(where)}: its frame '{name}' is not known; give it in the robot's base frame, or write "
             "base_link where the two are the same"
         )
+    note = f"frame '{name}' is taken to be the robot's base"
+    if known and note not in scene.notes:
+        scene.notes.append(note)
     return name
 
 
 def _add_object(scene: Scene, where: str, fields: dict[str, Any]) -> None:
-    if fields.get("operation") not in (None, 0, "0", "add", "ADD"):
+    if fields.get("operation") not in ADDED:
         raise InputError(
             f"{scene.at(where)}: operation {fields['operation']!r:.40} is no obstacle; keep objects to add"
         )

@@ -30,9 +30,11 @@ def write_world(world: WorldSpec, path: Path, title: str, overwrite: bool = Fals
     Raises:
         InputError: if the file exists and must not be overwritten, or cannot be written.
     """
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists; give --force to overwrite it")
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path} is not a file; give the path of one")
+        if path.exists() and not overwrite:
+            raise InputError(f"{path} exists; give --force to overwrite it")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(world_yaml(world, title), encoding="utf-8")
     except OSError as error:
