@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -134,8 +135,8 @@ def load_certificate(folder: Path, barrier: Mapping[str, Any]) -> Certificate | 
         assert found.verdict == overall(found.conditions)
         margin, dt, *_ = numbers = [found.subject["margin"], found.subject["dt"]]
         numbers += [found.details.get(key, 0.0) for key in ("power", "mass_error")]
-        assert all(isinstance(x, int | float) for x in numbers)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, AssertionError, RecursionError):
+        assert all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, AssertionError, RecursionError, OverflowError):
         raise InputError(f"{path}: not a certificate of this version; run `ppcbf verify {folder}` again") from None
     if found.subject != subject(barrier, margin, dt):
         raise InputError(f"{path}: belongs to another barrier (its hashes differ); run `ppcbf verify {folder}` again")

@@ -20,6 +20,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from ppcbf_robots.artefact import load_barrier, save_barrier
+from ppcbf_robots.certificate import Certificate, Condition, save_certificate, subject
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.problem import load_problem
@@ -286,3 +287,44 @@ def test_facts_of_noise(sound, two_link, content, at):
     for noise in (content, original[:cut] + content):
         folder = spoiled(sound, facts=noise)
         assert refused(lambda folder=folder: used(folder, two_link)) or noise.startswith(original.rstrip())
+
+
+@pytest.fixture(scope="module")
+def certified(sound):
+    """The contents of a certificate of the sound folder."""
+    folder = spoiled(sound)
+    about = subject(json.loads((folder / "barrier.json").read_text()), 1e-3, 1e-3)
+    held = Condition("proved", "some torque serves all rows", 0.0, None, 10, 0, 0.1)
+    found = Certificate("proved", {"feasibility": held}, about, ["errors"], 1.5, "proof", {"power": 0.5})
+    return json.loads(save_certificate(folder, found).read_text())
+
+
+def shown(folder, problem):
+    """What the commands do with a certificate."""
+    certificate = load_barrier(folder).certificate
+    if certificate is not None:
+        line, goal = certificate.line(), problem.model.to_angles(problem.robot.goal)
+        gap = certificate.gap(goal.tolist(), "qp", "kinetic", 50.0, 1e-3, 1e-3, False)
+        assert line and isinstance(gap, str)
+    return certificate
+
+
+def test_the_sound_certificate_counts(sound, certified, two_link):
+    (sound[1] / "certificate.json").write_text(json.dumps(certified))
+    assert shown(spoiled(sound), two_link).verdict == "proved"
+
+
+@FUZZ
+@given(data=st.data())
+def test_absurd_certificates(sound, certified, two_link, data):
+    facts = data.draw(absurd(certified))
+    (sound[1] / "certificate.json").write_text(json.dumps(facts))
+    shown(spoiled(sound), two_link)
+
+
+@FUZZ
+@given(content=st.binary(max_size=300), at=st.floats(0.0, 1.0))
+def test_certificates_of_noise(sound, certified, two_link, content, at):
+    whole = json.dumps(certified).encode()
+    (sound[1] / "certificate.json").write_bytes(whole[: int(at * len(whole))] + content)
+    shown(spoiled(sound), two_link)
