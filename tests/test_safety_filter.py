@@ -4,6 +4,9 @@ recovers, and its conventions are what its documentation says."""
 from __future__ import annotations
 
 import dataclasses
+import gc
+import logging
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -451,3 +454,29 @@ def test_a_filtered_arm_stays_in_its_domain(panda):
         assert np.all(np.abs(v) <= domain.v[:, 1])
         assert np.all((q >= domain.q[:, 0] - 1e-3) & (q <= domain.q[:, 1] + 1e-3))
     assert fastest.max() > 0.9  # it was tried
+
+
+@pytest.mark.parametrize("solver", ["daqp", "proxqp"])
+def test_no_memory_grows_from_step_to_step(panda, make_barrier, states, solver, monkeypatch):
+    model, controller = panda.model, panda.robot.controller
+    safe = SafetyFilter(model, panda.safety, make_barrier(panda, "pp-ncbf-convex"), FilterConfig(solver=solver))
+    asked = [(q, v, controller.evaluate(model.evaluate(q, v))) for q, v in states(panda, 50)]
+
+    def run(rounds: int) -> None:
+        for i in range(rounds):
+            for q, v, nominal in asked:
+                safe.filter(model.evaluate(q, v), nominal.u, float(nominal.d_p), t=1e-3 * i)
+                safe.step(1e-3 * i, q, v, nominal.u, float(nominal.d_p))
+
+    monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)  # pytest keeps every record
+    run(1)
+    tracemalloc.start()
+    grown = []
+    for _ in range(4):
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        run(5)
+        gc.collect()
+        grown.append(tracemalloc.get_traced_memory()[0] - before)
+    tracemalloc.stop()
+    assert min(grown) < 5_000  # of 500 steps, once there is a workspace for each size; 7 numbers a step would be 28,000
