@@ -325,6 +325,30 @@ def test_where_all_margins_are_large_nothing_joins(two_link):
     assert len(descent.rays) == first
 
 
+def test_states_that_leave_an_obstacle_are_trained_on_too(two_link, monkeypatch):
+    """Along their rays phi rises through the band: they say nothing of the volume, and their margins count."""
+    descent, model = margin_descent(two_link), two_link.model
+    rng, domain = np.random.default_rng(0), two_link.robot.domain
+    q, v = model.from_angles(domain.sample_q(rng, 20_000)), domain.sample_v(rng, 20_000)
+    rays = descent.rays_through(q, v)
+    leaving, rising = descent.band.field.crosses(descent.params, rays, torch.full((len(rays),), descent.epsilon))
+    assert leaving.sum() > 1000 and rising.sum() > 10 and not (leaving & rising).any()
+    found = rays.select(rising.nonzero()[:, 0])
+    s, on = descent.band.field.on_band(descent.params, found, torch.full((len(found),), 0.9 * descent.epsilon), True)
+    phi = descent.band.field.rows(descent.params, found, s).phi.amin(-1).detach()
+    assert on.float().mean() > 0.5
+    np.testing.assert_allclose(phi[on].numpy(), 0.9 * descent.epsilon, atol=1e-4)
+    count, known = len(descent.rays), len(descent._crossing)
+    monkeypatch.setattr(descent.band, "least_margin", lambda params, rays: (torch.zeros(len(rays)), None))
+    descent.add_counterexamples(found.q.double().numpy(), found.d.double().numpy())
+    descent._look()
+    assert len(descent._crossing) == known
+    added = torch.arange(count, len(descent.rays))
+    assert set(added.tolist()) <= set(descent._near.tolist())
+    index, _, _ = descent.sample(200, added, rising=True)
+    assert len(index) > 20 and not len(descent.sample(200, added)[0])
+
+
 def test_the_pool_is_bounded_and_keeps_what_matters(cartpole, monkeypatch):
     monkeypatch.setattr(margin_descent_module, "POOL_GROWTH", 200)
     descent = margin_descent(cartpole)
@@ -346,7 +370,11 @@ def test_half_of_a_batch_is_drawn_where_margins_are_small(cartpole, monkeypatch)
     descent = margin_descent(cartpole)
     pools: list[torch.Tensor] = []
     sample = descent.sample
-    monkeypatch.setattr(descent, "sample", lambda count, pool=None: (pools.append(pool), sample(count, pool))[1])
+    monkeypatch.setattr(
+        descent,
+        "sample",
+        lambda count, pool=None, rising=False: (pools.append(pool), sample(count, pool, rising=rising))[1],
+    )
     descent.iterate()
     assert [len(p) for p in pools] == [len(descent._crossing), len(descent._near)]
     assert torch.all(descent._noted[descent._near] < NEAR + descent.margin) or descent.iteration == 1

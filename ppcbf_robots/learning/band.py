@@ -71,10 +71,10 @@ class Band:
 
     @torch.no_grad()
     def least_margin(self, params: Params, rays: Rays) -> tuple[torch.Tensor, torch.Tensor]:
-        """Least margin over the band along every ray (B,), infinite where none crosses it, and its s (B,)."""
+        """Least margin over the band along every ray (B,), infinite where it has none of it, and its s (B,)."""
         least, at = torch.full_like(rays.d[:, 0], torch.inf), torch.zeros_like(rays.d[:, 0])
         for level in LEVELS:
-            s, crosses = self.field.on_band(params, rays, torch.full_like(least, self.level(level)))
+            s, crosses = self.field.on_band(params, rays, torch.full_like(least, self.level(level)), rising=True)
             found = crosses.nonzero()[:, 0]
             if not len(found):
                 continue

@@ -90,7 +90,7 @@ class MarginDescent(Descent):
         index, s, _ = self.sample(count, self._crossing)
         drawn = len(index)
         if len(self._near):
-            near, s_near, _ = self.sample(count, self._near)
+            near, s_near, _ = self.sample(count, self._near, rising=True)
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
@@ -139,7 +139,7 @@ class MarginDescent(Descent):
         self._join(self._hunted())
         self._look()
         with torch.no_grad():
-            index, s, crosses = self.sample(CHECK_STATES, params=self.judged)
+            index, s, crosses = self.sample(CHECK_STATES, params=self.judged, rising=True)
             if not len(index):
                 return 0.0, 0.0, 0.0
             rays = self.rays.select(index)
@@ -150,10 +150,14 @@ class MarginDescent(Descent):
 
     @torch.no_grad()
     def _look(self) -> None:
-        """Which rays cross the band now, and which of them have small margins; rays never seen are looked at."""
+        """Which rays leave the set through the band now, and which have band states of small margin.
+
+        Rays never seen on the band are looked at, also those along which phi rises: they say nothing of the volume.
+        """
         level = torch.full_like(self._noted, self.epsilon)
-        crossing = self.band.field.crosses(self.params, self.rays, level)
-        self._crossing = crossing.nonzero()[:, 0]
+        leaving, rising = self.band.field.crosses(self.params, self.rays, level)
+        crossing = leaving | rising
+        self._crossing = leaving.nonzero()[:, 0]
         new = (crossing & torch.isinf(self._noted)).nonzero()[:, 0]
         if len(new):
             self._noted[new] = self.band.least_margin(self.params, self.rays.select(new))[0].clamp(max=FAR_AWAY)

@@ -103,7 +103,7 @@ DEFAULT = Preset(
     refinement_share=0.3,
     refinement_rate=0.4,
     test_samples=10_000,
-    attack_rounds=50,
+    attack_rounds=30,
 )
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}

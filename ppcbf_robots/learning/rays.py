@@ -113,13 +113,13 @@ class Field:
         )
 
     @torch.no_grad()
-    def crosses(self, params: Params, rays: Rays, level: torch.Tensor) -> torch.Tensor:
-        """Which rays start above a level (B,) of ``min_k phi_k`` and end below it."""
+    def crosses(self, params: Params, rays: Rays, level: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Which rays start above a level (B,) of ``min_k phi_k`` and end below it, and which the other way about."""
         hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
         K = self.K_along(params, rays)(torch.ones_like(level))
         ends: torch.Tensor = (hdot + self.gamma * rays.h).amin(-1) - K
         starts: torch.Tensor = self.gamma * rays.h.amin(-1)
-        return (starts >= level) & (ends < level)
+        return (starts >= level) & (ends < level), (starts < level) & (ends >= level)
 
     @torch.no_grad()
     def on_band(
