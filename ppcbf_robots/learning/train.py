@@ -255,9 +255,9 @@ class Trainer:
         return check_band(self.problem, barrier, self.filter_config, count, self.descent.rng, passive)
 
     def _refine(self, tested: list[Tested], demanding: bool) -> None:
-        """The states found join and training goes on for a while, ``demanding`` more where some violate."""
+        """The states found join and training goes on for a while, ``demanding`` more or not."""
         self._join(tested)
-        if demanding and (not tested or any(t.violates for t in tested)):
+        if demanding:
             self.descent.demand_more()
         self.descent.planned = self.descent.iteration + int(self.preset.refinement_share * self.preset.iterations)
 
