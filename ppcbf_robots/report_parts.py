@@ -135,12 +135,11 @@ def _certificate(m: Material) -> Section:
     if found.method == "samples":
         without, tried = found.details.get("no_attack"), found.details.get("attacked", 0)
         known = sum(c.verdict == "refuted" for c in found.conditions.values())
-        result = "states that break a condition are known" if known else "found none that breaks a condition"
-        text.append(
-            f"No search went after single states: {without}."
-            if without
-            else f"A search over {tried:,} states: {result}."
+        result = "some that are known break a condition" if known else "none breaks a condition"
+        search = (
+            f"No search went after single states: {without}." if without else f"A search tried {tried:,}: {result}."
         )
+        text.append(search)
     return Section("certificate", "Certificate", text, [table], notes=found.not_covered, noted="Not covered")
 
 
@@ -148,12 +147,13 @@ def _certainty(verdict: str, c: Mapping[str, Any]) -> str:
     """How far a condition is certain, in words."""
     if verdict == "proved":
         return "on the whole band"
-    if verdict == "refuted":
+    if verdict == "refuted" and c["confidence"] is None:
         return "a counterexample is known" if c["violations"] is None else f"{c['violations']} violating states known"
     if c["bound"] is None or c["confidence"] is None:
         return "not known" if c["bound"] is None else f"open on at most {percent(c['bound'])} of the band"
     sure = f"fails on at most {c['bound']:.2g} of the band, with {100.0 * c['confidence']:.4g} % confidence"
-    return sure if c["samples"] is None else f"{sure} ({c['violations'] or 0} of {c['samples']:,} samples)"
+    sure += "" if c["samples"] is None else f" ({c['violations'] or 0} of {c['samples']:,} samples)"
+    return f"{sure}, and at states that are known" if verdict == "refuted" else sure
 
 
 def _one_run(m: Material) -> Section:

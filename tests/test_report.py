@@ -46,7 +46,13 @@ def trained(tmp_path, random_network) -> Path:
 def certify(folder: Path, **conditions: Condition) -> None:
     data = load_barrier(folder).data
     found = Certificate(
-        overall(conditions), conditions, subject(data, 1e-3, 1e-3), ["errors of the model"], 12.0, "samples"
+        overall(conditions),
+        conditions,
+        subject(data, 1e-3, 1e-3),
+        ["errors of the model"],
+        12.0,
+        "samples",
+        {"attacked": 500_000},
     )
     save_certificate(folder, found)
 
@@ -62,6 +68,7 @@ def test_report_says_what_is_known(trained, tmp_path, browser, monkeypatch, caps
         trained,
         feasibility=Condition("bounded", "some torque serves all rows", 1.5e-4, 0.999, 69_075, 2, 0.01),
         passivity=Condition("refuted", "d_p is enough", None, None, None, 7, -0.3),
+        input_bounds=Condition("refuted", "torque keeps its limits", 1e-4, 0.999, 69_075, 0, -0.1),
     )
     out = tmp_path / "report.html"
     given = ("report", trained, "--campaign", tmp_path / "c" / "campaign.json", *SHORT, "--out", out, "--json")
@@ -75,7 +82,8 @@ def test_report_says_what_is_known(trained, tmp_path, browser, monkeypatch, caps
         "two_link in circle", "Training did not converge (stopped <early>) after 40 iterations",
         "keeps 94.0% of that of the untrained LB-CBF", "3 of 1000 uniform states", "margin is -0.2500 in 500 states",
         "Refuted: states are known", "at most 0.00015 of the band, with 99.9 % confidence (2 of 69,075 samples)",
-        "7 violating states known", "errors of the model", "3 runs of 0.2 s from random safe states to random goals",
+        "7 violating states known", "A search tried 500,000: some",
+        "(0 of 69,075 samples), and at states that are known", "errors of the model", "3 runs of 0.2 s from random safe states to random goals",
         f"least h {facts['min_h']:.6f}", "runs with a contact 0", "still moving", "shoulder", "elbow", "sphere",
         f"least clearance to an obstacle {said['run']['clearance']:.5f} m", f"{said['median_us']:.0f} µs",
         "no safety-rated function",
