@@ -136,18 +136,24 @@ def _on_dask(tasks: Sequence[Task], address: str) -> Generator[tuple[Task, Outco
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"no Dask scheduler answers at '{address}' ({_sentence(error)})") from None
-    with client:
-        waiting = {client.submit(_outcome, task.function, pure=False): task for task in tasks}
-        for future in as_completed(list(waiting), loop=client.loop):
-            try:
-                outcome = future.result()
-            except KilledWorker:
-                outcome = _died()
-            except CancelledError:
-                raise InputError(f"the Dask scheduler at '{address}' is gone; the results so far are kept") from None
-            task = waiting.pop(future)
-            future.release()  # else Dask runs the task again if the worker that holds its result dies
-            yield task, outcome
+    gone = InputError(f"the Dask scheduler at '{address}' is gone; the results so far are kept")
+    try:
+        with client:
+            waiting = {client.submit(_outcome, task.function, pure=False): task for task in tasks}
+            for future in as_completed(list(waiting), loop=client.loop):
+                try:
+                    outcome = future.result()
+                except KilledWorker:
+                    outcome = _died()
+                except CancelledError:
+                    raise gone from None
+                task = waiting.pop(future)
+                future.release()  # else Dask runs the task again if the worker that holds its result dies
+                yield task, outcome
+    except (AssertionError, OSError):  # what a client that lost its scheduler in the wrong moment ends with
+        if client.status == "running":
+            raise
+        raise gone from None
 
 
 def _named_outcome(name: str, function: Callable[[], dict[str, Any]]) -> tuple[str, Outcome]:
