@@ -97,9 +97,8 @@ def verify(
     else:
         found = _prove(problem, stored, folder, power, mass_error / 100.0, jobs, time_limit)
     judged, states, details = found
-    seconds_spent = max(
-        time.monotonic() - began, details.pop("seconds", 0.0)
-    )  # also by runs that this one went on from
+    # also by earlier runs that a proof went on from
+    seconds_spent = max(time.monotonic() - began, details.pop("seconds", 0.0))
     certificate = Certificate(
         overall(judged), judged, _subject(stored), _not_covered(mass_error), round(seconds_spent, 2),
         "samples" if reason else "proof", details,

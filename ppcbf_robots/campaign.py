@@ -149,7 +149,7 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     """
     contacts, end = run.meta["contacts"], run.ending()
     known = np.isfinite(run.h) & np.isfinite(run.V) & np.isfinite(run.u).all(axis=1)  # not all of a run that diverges
-    work = _push_work(problem.model, case, run)[known]
+    work, rates = _push_work(problem.model, case, run)[known], run.rate_ratios(problem.model)
     unexplained = run.V[known] - work
     rise = float(np.max(unexplained) - unexplained[0])
     h, pairs = run.h[known], run.clearance[known]
@@ -163,9 +163,7 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
         "contact": clearance < 0.0 if contacts is None else contacts["steps"] > 0,
         "beyond_limit": bool(beyond.any()),
         "torque": float(np.max(np.abs(run.u[known]) / problem.model.u_max)),
-        "rate": _rate(
-            problem.model, run.u[known & (run.status != Status.STOP)], float(run.t[-1]) / max(1, len(run.t) - 1)
-        ),
+        "rate": 0.0 if rates is None else float(rates[known[1:] & known[:-1]].max(initial=0.0)),
         "energy_rise": rise,
         "energy_share": rise / max(float(unexplained[0]), ENERGY_FLOOR),
         "injected": float(np.max(unexplained - np.minimum.accumulate(unexplained))),
@@ -183,11 +181,6 @@ def _push_work(model: RobotModel, case: Case, run: Trajectory) -> Array:
     moved = np.where(model.continuous, (moved + np.pi) % (2.0 * np.pi) - np.pi, moved)
     pushed = push_torques(case.pushes, run.t, model.nv)[:-1]
     return np.concatenate([[0.0], np.cumsum((pushed * moved).sum(axis=1))])
-
-
-def _rate(model: RobotModel, u: Array, dt: float) -> float:
-    """Largest change of torque from one control step to the next over what the rate limits allow."""
-    return float(np.max(np.abs(np.diff(u, axis=0)) / (model.u_rate * dt), initial=0.0))
 
 
 def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:

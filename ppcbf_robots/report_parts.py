@@ -190,8 +190,8 @@ def _campaign(m: Material) -> Section:
         + (f"; {' and '.join(given)}." if given else ".")
     ]
     if not same_barrier(m):
-        now = m.campaign is not None and m.campaign["barrier"] == str(m.folder.resolve())
-        text.append(f"These runs used another barrier: {'one that was here before' if now else facts['barrier']}.")
+        here = facts["barrier"] == str(m.folder.resolve())
+        text.append(f"These runs used another barrier: {'one that was here before' if here else facts['barrier']}.")
     rows = [
         ["runs with a contact", str(facts["contacts"])],
         ["runs beyond a torque limit", str(facts["torque_violations"])],

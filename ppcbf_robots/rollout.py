@@ -81,7 +81,7 @@ class Trajectory:
         error = float(np.max(np.abs(model.difference(self.q[-1], goal))))
         end = self.ending()
         contacts = self.meta.get("contacts")  # absent in files of version 0.1.0
-        rates = self._rate_ratios(model)
+        rates = self.rate_ratios(model)
         return {
             "min_h": float(self.h.min()),
             "clearance": float(self.clearance.min()),
@@ -103,7 +103,7 @@ class Trajectory:
             "filter_counts": {Status(s).name.lower(): int(np.sum(self.status == s)) for s in np.unique(self.status)},
         }
 
-    def _rate_ratios(self, model: RobotModel) -> Array | None:
+    def rate_ratios(self, model: RobotModel) -> Array | None:
         """Largest ``|u̇_i| / u_rate_i`` of each step (T - 1,), 0 to and from a STOP; None without rate limits."""
         if not np.any(np.isfinite(model.u_rate)):
             return None

@@ -9,7 +9,8 @@ import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.world_files.meshes import MAX_POINTS
-from ppcbf_robots.world_files.scene_parts import MAX_NUMBER, Scene, part_names, pose_of, positive
+from ppcbf_robots.world_files.scene_parts import Scene, part_names, pose_of, positive
+from ppcbf_robots.world_shapes import FARTHEST
 
 SHAPES = {"sphere": 1, "box": 3, "cylinder": 2, "cone": 2, "plane": 4, "mesh": 2}  # numbers after the name
 MAX_COUNT = 10_000  # shapes or subframes of an object
@@ -48,7 +49,7 @@ class _Words:
             value = float(word) if "_" not in word else np.nan
         except ValueError:
             value = np.nan
-        if not abs(value) <= MAX_NUMBER:
+        if not abs(value) <= FARTHEST:
             raise InputError(f"{self.path}: {self.where()}: expected {what}, got '{word[:40]}'")
         return value
 

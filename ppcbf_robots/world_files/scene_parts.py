@@ -16,6 +16,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.specs import Array, Spec, validate
 from ppcbf_robots.world import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Sphere, WorldSpec
 from ppcbf_robots.world_files.meshes import hull, mesh_hull
+from ppcbf_robots.world_shapes import FARTHEST
 
 KINDS: dict[str, type[Spec]] = {
     "sphere": Sphere,
@@ -25,7 +26,6 @@ KINDS: dict[str, type[Spec]] = {
     "cylinder": Cylinder,
     "mesh": ConvexMesh,
 }
-MAX_NUMBER = 1e4  # [m]; farther than any arm reaches
 QUATERNION_TOLERANCE = 0.02  # files hold two digits at times; world specs are stricter
 DECIMALS = 12  # of composed poses, which hides what floating point adds to zeros
 CONE_SIDES = 24
@@ -109,8 +109,8 @@ def number(value: Any, where: str) -> float:
     """A finite number that can be a length in metres."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: expected a number, got {reprlib.repr(value)}")
-    if not abs(value) <= MAX_NUMBER:  # also false for NaN
-        raise InputError(f"{where}: expected a number of at most {MAX_NUMBER:g}, got {reprlib.repr(value)}")
+    if not abs(value) <= FARTHEST:  # also false for NaN
+        raise InputError(f"{where}: expected a number of at most {FARTHEST:g}, got {reprlib.repr(value)}")
     return float(value)
 
 
