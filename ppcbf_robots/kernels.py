@@ -35,12 +35,17 @@ def kernel(function: F) -> F:
     return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=FAST_MATH)(function))
 
 
+def inlined(function: F) -> F:
+    """The same, copied into its callers: a call with a few arrays costs as much as the distance to a box."""
+    return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=FAST_MATH, inline="always")(function))
+
+
 def exact_kernel(function: F) -> F:
     """The same with IEEE arithmetic as written, for bounds that count rounding errors; runs beside other threads."""
     return cast(F, numba.njit(cache=True, error_model="numpy", nogil=True)(function))
 
 
-@kernel
+@inlined
 def _ramp(x: float, rho: float) -> tuple[float, float, float]:
     """Smoothed ``max(x, 0)`` and its first two derivatives."""
     if x <= 0.0:
@@ -51,7 +56,7 @@ def _ramp(x: float, rho: float) -> tuple[float, float, float]:
     return rho * t * t * t * (1.0 - 0.5 * t), t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) / rho
 
 
-@kernel
+@inlined
 def _box(x: Vector, w: Vector, size: Any) -> Core:
     """size: half edges and rho. Norm of three overshoots."""
     rho = size[3]
@@ -68,7 +73,7 @@ def _box(x: Vector, w: Vector, size: Any) -> Core:
     return d - 0.5 * math.sqrt(3.0) * rho, (second - along * along) / d, n0, n1, n2
 
 
-@kernel
+@inlined
 def _capsule(x: Vector, w: Vector, size: Any) -> Core:
     """size: radius, half length of the segment along z, rho."""
     s, s1, s2 = _ramp(abs(x[2]) - size[1], size[2])
@@ -79,7 +84,7 @@ def _capsule(x: Vector, w: Vector, size: Any) -> Core:
     return d - size[0], (second - along * along) / d, n0, n1, n2
 
 
-@kernel
+@inlined
 def _cylinder(x: Vector, w: Vector, size: Any) -> Core:
     """size: radius, half length along z, rho. Norm of the radial and the axial overshoot."""
     rho = size[2]
@@ -118,7 +123,7 @@ def _mesh(x: Vector, w: Vector, kappa: float, planes: Any, first: int, end: int)
     return d, kappa * (square / total - along * along), n0 / total, n1 / total, n2 / total
 
 
-@kernel
+@inlined
 def core(kind: int, x: Vector, w: Vector, size: Any, planes: Any, first: int, end: int) -> Core:
     """Distance [m] of a point to an obstacle, second order term ``wᵀ H w`` and gradient, in the obstacle's frame.
 
@@ -201,7 +206,7 @@ def points_at(placements: Any, J: Any, dJ: Any, v: Any, joints: Any, offsets: An
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p[s], Jp[s], vel, acc[s])
 
 
-@kernel
+@inlined
 def _obstacle_row(
     p: Vector, vel: Vector, acc: Vector, kind: int, size: Any, planes: Any, first: int, end: int, f: Any,
     motion: Any, moves: bool,
@@ -239,61 +244,143 @@ def _obstacle_row(
 
 
 @kernel
+def _pair_rows(
+    p: Any, vel: Any, acc: Any, radii: Any, kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any,
+    frames: Any, motions: Any, moving: Any, self_pairs: Any, h: Any, drift: Any, curvature: Any, n: Any,
+) -> None:  # fmt: skip
+    """All rows of pairs at one state, and in n (pairs, 3) the direction of each, in the base frame."""
+    P, O = len(p), len(kinds)
+    for o in range(O):
+        kind, size, frame, motion, moves = kinds[o], sizes[o], frames[o], motions[o], moving[o]
+        first, end = plane_start[o], plane_start[o + 1]
+        for i in range(P):
+            row = i * O + o
+            d, drift[row], curvature[row], n[row, 0], n[row, 1], n[row, 2] = _obstacle_row(
+                (p[i, 0], p[i, 1], p[i, 2]), (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2]),
+                kind, size, planes, first, end, frame, motion, moves,
+            )  # fmt: skip
+            h[row] = d - radii[i] - margins[o]
+    row = P * O
+    for k in range(len(self_pairs)):
+        a, b = self_pairs[k, 0], self_pairs[k, 1]
+        square = along = speed = push = 0.0
+        for r in range(3):
+            n[row, r] = p[a, r] - p[b, r]
+            square += n[row, r] * n[row, r]
+        d = max(math.sqrt(square), _TINY)
+        for r in range(3):
+            n[row, r] /= d
+            w = vel[a, r] - vel[b, r]
+            along += n[row, r] * w
+            speed += w * w
+            push += n[row, r] * (acc[a, r] - acc[b, r])
+        h[row] = d - radii[a] - radii[b]
+        drift[row], curvature[row] = 0.0, push + (speed - along * along) / d
+        row += 1
+
+
+@kernel
+def _gradient(row: int, n: Any, Jp: Any, O: int, self_pairs: Any, out: Any) -> None:
+    """∇h (nv,) of a pair's row."""
+    pairs, nv = len(Jp) * O, len(out)
+    if row < pairs:
+        i = row // O
+        for j in range(nv):
+            out[j] = n[row, 0] * Jp[i, 0, j] + n[row, 1] * Jp[i, 1, j] + n[row, 2] * Jp[i, 2, j]
+        return
+    a, b = self_pairs[row - pairs, 0], self_pairs[row - pairs, 1]
+    for j in range(nv):
+        out[j] = 0.0
+        for r in range(3):
+            out[j] += n[row, r] * (Jp[a, r, j] - Jp[b, r, j])
+
+
+@kernel
+def _closing(row: int, n: Any, vel: Any, O: int, self_pairs: Any) -> float:
+    """ḣ of a pair's row where obstacles rest."""
+    pairs, hdot = len(vel) * O, 0.0
+    if row < pairs:
+        for r in range(3):
+            hdot += n[row, r] * vel[row // O, r]
+        return hdot
+    a, b = self_pairs[row - pairs, 0], self_pairs[row - pairs, 1]
+    for r in range(3):
+        hdot += n[row, r] * (vel[a, r] - vel[b, r])
+    return hdot
+
+
+@kernel
 def rows_at(
-    placements: Any, J: Any, dJ: Any, v: Any, angles: Any, joints: Any, offsets: Any, mask: Any, radii: Any,
+    placements: Any, J: Any, dJ: Any, v: Any, angles: Any, h: Any, grad: Any, drift: Any, curvature: Any,
+    joints: Any, offsets: Any, mask: Any, radii: Any,
     kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any, frames: Any, motions: Any,
     self_pairs: Any, limit_joint: Any, limit_sign: Any, limit_bound: Any,
-    h: Any, grad: Any, drift: Any, curvature: Any,
 ) -> None:  # fmt: skip
     """All rows at a batch of states: body points by obstacles (obstacle fastest), self-collision pairs, joint limits.
 
     Inputs of one state as in :func:`point_kinematics` with a leading batch axis; outputs h, drift, curvature (B, rows)
-    and grad (B, rows, nv). Obstacles as packed by :class:`ppcbf_robots.shapes.Packed`.
+    and grad (B, rows, nv). Then follow the body's points and radii, obstacles as packed by
+    :class:`ppcbf_robots.shapes.Packed`, self-collision pairs (:, 2) and joint limits.
     """
     P, O, nv = len(joints), len(kinds), v.shape[1]
     p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
-    Jp, n = np.empty((P, 3, nv)), np.empty(3)
+    pairs = P * O + len(self_pairs)
+    Jp, n = np.empty((P, 3, nv)), np.empty((pairs, 3))
     moving = np.array([np.any(motions[o] != 0.0) for o in range(O)])
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
-        for o in range(O):
-            kind, size, frame, motion, moves = kinds[o], sizes[o], frames[o], motions[o], moving[o]
-            first, end = plane_start[o], plane_start[o + 1]
-            for i in range(P):
-                d, h_t, second, n0, n1, n2 = _obstacle_row(
-                    (p[i, 0], p[i, 1], p[i, 2]), (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2]),
-                    kind, size, planes, first, end, frame, motion, moves,
-                )  # fmt: skip
-                row = i * O + o
-                h[s, row] = d - radii[i] - margins[o]
-                drift[s, row], curvature[s, row] = h_t, second
-                for j in range(nv):
-                    grad[s, row, j] = n0 * Jp[i, 0, j] + n1 * Jp[i, 1, j] + n2 * Jp[i, 2, j]
-        row = P * O
-        for k in range(len(self_pairs)):
-            a, b = self_pairs[k, 0], self_pairs[k, 1]
-            square = along = speed = push = 0.0
-            for r in range(3):
-                n[r] = p[a, r] - p[b, r]
-                square += n[r] * n[r]
-            d = max(math.sqrt(square), _TINY)
-            for r in range(3):
-                n[r] /= d
-                w = vel[a, r] - vel[b, r]
-                along += n[r] * w
-                speed += w * w
-                push += n[r] * (acc[a, r] - acc[b, r])
-            h[s, row] = d - radii[a] - radii[b]
-            drift[s, row], curvature[s, row] = 0.0, push + (speed - along * along) / d
-            for j in range(nv):
-                grad[s, row, j] = 0.0
-                for r in range(3):
-                    grad[s, row, j] += n[r] * (Jp[a, r, j] - Jp[b, r, j])
-            row += 1
+        _pair_rows(p, vel, acc, radii, kinds, sizes, margins, planes, plane_start, frames, motions, moving, self_pairs,
+                   h[s], drift[s], curvature[s], n)  # fmt: skip
+        for row in range(pairs):
+            _gradient(row, n, Jp, O, self_pairs, grad[s, row])
         for k in range(len(limit_joint)):
-            j = limit_joint[k]
+            row, j = pairs + k, limit_joint[k]
             h[s, row] = limit_sign[k] * (angles[s, j] - limit_bound[k])
             drift[s, row] = curvature[s, row] = 0.0
             grad[s, row, :] = 0.0
             grad[s, row, j] = limit_sign[k]
-            row += 1
+
+
+@kernel
+def nearest_rows_at(
+    placements: Any, J: Any, dJ: Any, v: Any, angles: Any, gamma: float, share: Any,
+    least: Any, least_rho: Any, h: Any, grad: Any, curvature: Any,
+    joints: Any, offsets: Any, mask: Any, radii: Any,
+    kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any, frames: Any, motions: Any,
+    self_pairs: Any, limit_joint: Any, limit_sign: Any, limit_bound: Any,
+) -> None:  # fmt: skip
+    """Of :func:`rows_at`, among obstacles at rest, the rows of least ``gamma h + min(ḣ, 0)``, in that order.
+
+    share (B,) is that of v at which ``rho = ḣ + gamma h`` is asked for. Outputs: least h and least rho (B,) of all
+    rows; h, curvature (B, N) and grad (B, N, nv) of the nearest N.
+    """
+    P, O, nv, count = len(joints), len(kinds), v.shape[1], h.shape[1]
+    p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
+    pairs, rows = P * O + len(self_pairs), P * O + len(self_pairs) + len(limit_joint)
+    Jp, n = np.empty((P, 3, nv)), np.empty((pairs, 3))
+    all_h, drift, second, key = np.empty(rows), np.empty(rows), np.empty(rows), np.empty(rows)
+    still = np.zeros(O, dtype=np.bool_)
+    for s in range(len(v)):
+        point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
+        _pair_rows(p, vel, acc, radii, kinds, sizes, margins, planes, plane_start, frames, motions, still, self_pairs,
+                   all_h, drift, second, n)  # fmt: skip
+        least[s] = least_rho[s] = np.inf
+        for row in range(rows):
+            if row >= pairs:
+                k = row - pairs
+                all_h[row], second[row] = limit_sign[k] * (angles[s, limit_joint[k]] - limit_bound[k]), 0.0
+                hdot = limit_sign[k] * v[s, limit_joint[k]]
+            else:
+                hdot = _closing(row, n, vel, O, self_pairs)
+            least[s] = min(least[s], all_h[row])
+            least_rho[s] = min(least_rho[s], share[s] * hdot + gamma * all_h[row])
+            key[row] = gamma * all_h[row] + min(hdot, 0.0)
+        for at in range(count):
+            row = int(np.argmin(key))
+            key[row] = np.inf
+            h[s, at], curvature[s, at] = all_h[row], second[row]
+            if row < pairs:
+                _gradient(row, n, Jp, O, self_pairs, grad[s, at])
+            else:
+                grad[s, at, :] = 0.0
+                grad[s, at, limit_joint[row - pairs]] = limit_sign[row - pairs]

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.kernels import rows_at
+from ppcbf_robots.kernels import nearest_rows_at, rows_at
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.shapes import Packed, pack
 from ppcbf_robots.specs import Array, BodySphere
@@ -35,6 +36,17 @@ class SafetyRows:
     def hdot(self, v: Array) -> Array:
         """ḣ (..., rows) at velocity v (..., nv)."""
         return np.asarray((self.grad @ v[..., None])[..., 0] + self.drift)
+
+
+@dataclass(frozen=True)
+class NearestRows:
+    """What a band state needs of B states' rows: N of them, nearest first, and the least of all."""
+
+    least_h: Array  # (B,)
+    least_rho: Array  # (B,) of ``ḣ + gamma h``
+    h: Array  # (B, N)
+    grad: Array  # (B, N, nv)
+    curvature: Array  # (B, N)
 
 
 class SafetyFunction:
@@ -125,17 +137,34 @@ class SafetyFunction:
         self, placements: Array, J: Array, dJ: Array, v: Array, angles: Array, o: Packed
     ) -> tuple[Array, Array, Array, Array]:
         """h, gradient, drift and curvature of a batch."""
-        count, points = len(v), self.points
-        h, drift, curvature = (np.empty((count, self.rows)) for _ in range(3))
-        grad = np.empty((count, self.rows, self.robot.nv))
-        rows_at(
-            placements, J, dJ, v, angles,
+        h, drift, curvature = (np.empty((len(v), self.rows)) for _ in range(3))
+        grad = np.empty((len(v), self.rows, self.robot.nv))
+        rows_at(placements, J, dJ, v, angles, h, grad, drift, curvature, *self._scene(o))
+        return h, grad, drift, curvature
+
+    def nearest(self, dyn: Dynamics, gamma: float, share: Array, count: int) -> NearestRows:
+        """The ``count`` rows of least ``gamma h + min(ḣ, 0)`` at each of B states, among obstacles at rest.
+
+        ``share`` (B,) is that of v at which the least rho is asked for.
+        """
+        size, nv = dyn.v.shape
+        count = min(count, self.rows)
+        least, least_rho = np.empty(size), np.empty(size)
+        h, curvature, grad = np.empty((size, count)), np.empty((size, count)), np.empty((size, count, nv))
+        nearest_rows_at(
+            dyn.placements, dyn.J, dyn.dJ, dyn.v, self.robot.to_angles(dyn.q), gamma, share,
+            least, least_rho, h, grad, curvature, *self._scene(self.packed),
+        )  # fmt: skip
+        return NearestRows(least, least_rho, h, grad, curvature)
+
+    def _scene(self, o: Packed) -> tuple[Any, ...]:
+        """Body, obstacles, pairs and limits as the kernels take them."""
+        points = self.points
+        return (
             points.joints, points.offsets, points.mask, self._radii,
             o.kinds, o.sizes, o.margins, o.planes, o.plane_start, o.frames, o.motions,
             self._self_pairs, self._limit_joint, self._limit_sign, self._limit_bound,
-            h, grad, drift, curvature,
         )  # fmt: skip
-        return h, grad, drift, curvature
 
     def least(self, q: Array) -> tuple[float, str]:
         """Smallest h at rest in q and the name of its row."""

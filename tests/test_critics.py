@@ -19,8 +19,8 @@ from ppcbf_robots.closed_form import ClosedForm
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning.band import Band
-from ppcbf_robots.learning.critics import closed_form_critics, feasibility
-from ppcbf_robots.learning.linear_program import best_worst_row
+from ppcbf_robots.learning.critics import LEAST_CAPABILITY, Feasibility, closed_form_critics, feasibility
+from ppcbf_robots.learning.linear_program import best_worst_row, pivot_together
 from ppcbf_robots.learning.rays import Rays, rays_at, to_tensors
 from ppcbf_robots.network import NumpyNetwork, random_convex
 from ppcbf_robots.problem import Problem
@@ -131,12 +131,16 @@ def largest(offset: np.ndarray, c: np.ndarray, p: np.ndarray, budget: float) -> 
 KINDS = ["any", "equal rows", "zero rows", "opposite rows", "few values", "one joint moves", "rest", "least budget"]
 
 
+SOLVERS = [best_worst_row, pivot_together]  # compiled, and as on other devices
+
+
+@pytest.mark.parametrize("solve", SOLVERS)
 @pytest.mark.parametrize("kind", KINDS)
 @tries(max_examples=25)
 @given(n=st.integers(1, 8), rows=st.integers(1, 16), seed=st.integers(0, 2**32 - 1))
-def test_the_best_worst_row_is_that_of_a_linear_programming_solver(kind, n, rows, seed):
+def test_the_best_worst_row_is_that_of_a_linear_programming_solver(solve, kind, n, rows, seed):
     states = programs(n, rows, seed, kind)
-    value, share, z = (x.numpy() for x in best_worst_row(*(torch.as_tensor(x) for x in states)))
+    value, share, z = (x.numpy() for x in solve(*(torch.as_tensor(x) for x in states)))
     for i, (offset, c, p, budget) in enumerate(zip(*states, strict=True)):
         assert value[i] == pytest.approx(largest(offset, c, p, budget + 1e-12), abs=1e-7)
         assert np.all(np.abs(z[i]) <= 1.0 + 1e-8)
@@ -147,12 +151,13 @@ def test_the_best_worst_row_is_that_of_a_linear_programming_solver(kind, n, rows
         assert dual(offset, c, p, budget, share[i]) == pytest.approx(value[i], abs=1e-7)
 
 
+@pytest.mark.parametrize("solve", SOLVERS)
 @pytest.mark.parametrize("kind", ["zero rows", "opposite rows"])
 @pytest.mark.parametrize(("n", "rows"), [(7, 8), (8, 16)])
-def test_rounding_does_not_break_one_program_in_thousands(n, rows, kind):
+def test_rounding_does_not_break_one_program_in_thousands(n, rows, kind, solve):
     """Pivots that are noise must not be taken: z is feasible and attains the value that the share proves."""
     offset, c, p, budget = (torch.as_tensor(x) for x in programs(n, rows, 1, kind, count=10_000))
-    value, _, z = best_worst_row(offset, c, p, budget)
+    value, _, z = solve(offset, c, p, budget)
     assert ((p * z).sum(-1) - budget).max() <= 1e-8
     assert z.abs().max() <= 1.0 + 1e-8
     attained = (offset + (c * z[:, None]).sum(-1)).amin(-1)
@@ -161,7 +166,7 @@ def test_rounding_does_not_break_one_program_in_thousands(n, rows, kind):
 
 def test_programs_of_one_batch_do_not_see_each_other():
     states = [torch.as_tensor(x) for x in programs(5, 9, 0, "any", count=30)]
-    together = best_worst_row(*states)
+    together = pivot_together(*states)
     for i in range(30):
         alone = best_worst_row(*(x[i : i + 1] for x in states))
         for a, b in zip(alone, together, strict=True):
@@ -211,21 +216,29 @@ class Rows:
             FilterConfig(alpha=3.0, dt=0.1),
         )
 
-    def margin(self, passive: bool, Lf: Any = None, Lg: Any = None, phi: Any = None) -> torch.Tensor:
-        """What the learner computes, of other rows if they are given."""
+    def programs(self, passive: bool, Lf: Any = None, Lg: Any = None, phi: Any = None) -> Feasibility:
+        """What the learner solves, of other rows if they are given."""
         given = [torch.as_tensor(a if b is None else b) for a, b in ((self.phi, phi), (self.Lf, Lf), (self.Lg, Lg))]
         others = [torch.as_tensor(x) for x in (self.v, self.u_des, self.d_p, self.u_max)]
         rows = BarrierRows(None, torch.as_tensor(self.hdot), *given, None)
-        programs = feasibility(rows, *others, self.config, passive)
+        return feasibility(rows, *others, self.config, passive)
+
+    def margin(self, passive: bool, *rows: Any) -> torch.Tensor:
+        """What the learner computes, of other rows if they are given."""
+        programs = self.programs(passive, *rows)
         margin: torch.Tensor = programs.margin(programs.solve())
         return margin
 
-    def exact(self, passive: bool) -> np.ndarray:
-        """``max t``, ``t <= offset_k + c_k u`` for all k, u in the box and ``vᵀ(u - u_des) <= d_p``; NaN if empty."""
+    def exact(self, passive: bool, demands: bool = True) -> np.ndarray:
+        """``max t``, ``t <= offset_k + c_k u`` for all k, u in the box and ``vᵀ(u - u_des) <= d_p``; NaN if empty.
+
+        Without ``demands`` no offset is below zero.
+        """
         authority = np.abs(self.Lg) @ self.u_max
         separating = np.maximum(0.0, np.minimum(self.hdot, self.phi))
         allowed = self.config.alpha * (self.phi - self.config.margin) + self.config.fast_alpha * separating
         offset = (self.Lf + allowed) / authority
+        offset = offset if demands else np.maximum(offset, 0.0)
         c, p = self.Lg * self.u_max / authority[..., None], self.v * self.u_max
         budget = np.where(passive, (self.v * self.u_des).sum(-1) + self.d_p, np.abs(p).sum(-1))
         return np.array([largest(*state) for state in zip(offset, c, p, budget, strict=True)])
@@ -246,6 +259,29 @@ def test_the_feasibility_margin_is_exact(rows, nv, passive):
     Lf, Lg = (torch.as_tensor(x).requires_grad_() for x in (states.Lf, states.Lg))
     states.margin(passive, Lf, Lg).sum().backward()
     assert torch.isfinite(Lf.grad).all() and torch.isfinite(Lg.grad).all()
+
+
+@pytest.mark.parametrize(("rows", "nv"), [(1, 7), (2, 2), (6, 7)])
+def test_the_capability_is_the_margin_where_nothing_is_asked_for(rows, nv):
+    states = Rows.random(rows, nv, seed=rows + nv)
+    programs = states.programs(passive=True)
+    capability, margin = programs.capability().numpy(), states.margin(True).numpy()
+    expected = np.maximum(states.exact(passive=False, demands=False), LEAST_CAPABILITY)
+    np.testing.assert_allclose(capability, expected, atol=1e-7)
+    assert np.all(margin <= capability + 1e-9)
+    if rows == 1:
+        np.testing.assert_allclose(capability, np.maximum(1.0, 1.0 + programs.offset[:, 0].numpy()))
+
+
+def test_joints_in_line_that_run_into_their_limits_can_do_little_and_are_asked_for_nothing():
+    """The torques of one row are the opposite of the other's: the margin is small, and the reserve is all there is."""
+    Lg = np.array([[[1.0, -0.98], [-0.98, 1.0]]]) * 100.0
+    at_rest = Rows(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), Lg, *np.zeros((2, 1, 2)), np.zeros(1),
+                   np.ones(2), FilterConfig(alpha=3.0, margin=0.0, dt=0.1))  # fmt: skip
+    margin, capability = float(at_rest.margin(True)), float(at_rest.programs(True).capability())
+    assert margin == pytest.approx(0.02 / 1.98) and capability == pytest.approx(margin)
+    hard = dataclasses.replace(at_rest, Lf=np.full((1, 2), -1.0))  # half of what there is
+    assert float(hard.margin(True)) / capability == pytest.approx(0.5)
 
 
 def test_the_passivity_row_counts_where_it_is_asked_for():

@@ -67,14 +67,14 @@ def evaluated(problem: Problem, q: Any, v: Any) -> Any:
     return dyn, problem.safety.evaluate(dyn)
 
 
-def margins(problem: Problem, q: Any, v: Any) -> np.ndarray:
-    """Margins of states themselves, with all rows."""
+def reserves(problem: Problem, q: Any, v: Any) -> np.ndarray:
+    """Reserves of states themselves, with all rows."""
     arrays, _, free = rays_at(problem, q, v, 1000)
     assert free.all()
     rays = Rays(**to_tensors([arrays], CPU, torch.float64))
     s = torch.as_tensor(np.linalg.norm(v, axis=1) / np.linalg.norm(arrays["d"], axis=1))
     params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(problem).items()}
-    return np.asarray(make(problem).band.margin(params, rays, s))
+    return np.asarray(make(problem).band.reserve(params, rays, s))
 
 
 @pytest.mark.parametrize("passive", [True, False])
@@ -95,7 +95,7 @@ def test_it_also_finds_what_few_states_of_the_band_violate(brisk_panda):
     """The LB barrier drops passivity somewhere."""
     found = attack(brisk_panda, rounds=30)
     assert found.worst < 0.0
-    clear = margins(brisk_panda, found.q, found.v) < -1e-6
+    clear = reserves(brisk_panda, found.q, found.v) < -1e-6
     assert clear.mean() > 0.9
     assert min(statuses(brisk_panda, found.q[clear], found.v[clear])) >= Status.PASSIVITY_DROPPED
 
@@ -107,11 +107,11 @@ def test_nothing_is_found_where_there_is_torque_enough(two_link):
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 5])
-def test_the_worst_is_the_least_margin_of_what_is_returned(weak, rounds):
+def test_the_worst_is_the_least_reserve_of_what_is_returned(weak, rounds):
     """The points it starts from included."""
     found = attack(weak, rounds=rounds)
     assert len(found.q)
-    assert margins(weak, found.q, found.v).min() == pytest.approx(found.worst, rel=1e-6)
+    assert reserves(weak, found.q, found.v).min() == pytest.approx(found.worst, rel=1e-6)
 
 
 def test_descent_goes_below_the_random_points(two_link):
@@ -124,7 +124,7 @@ def test_points_that_are_spent_are_replaced_and_count(weak, monkeypatch):
     monkeypatch.setattr(module, "LAST_STEP", 1.0)  # all of them in every round
     found, without = attack(weak, rounds=3), attack(weak, rounds=0)
     assert found.evaluated > 4 * without.evaluated - 1
-    assert margins(weak, found.q, found.v).min() == pytest.approx(found.worst, rel=1e-6)
+    assert reserves(weak, found.q, found.v).min() == pytest.approx(found.worst, rel=1e-6)
 
 
 def test_a_seed_repeats_a_search(weak):
@@ -149,7 +149,7 @@ def test_a_search_goes_on_where_it_was(weak):
     falsifier.search(params, rounds=3, starts=starts)
     assert starts.points.shape == (STARTS, 5) and (starts.age <= 3).all() and (starts.step >= LAST_STEP).all()
     before, value = starts.points.copy(), starts.value.copy()
-    np.testing.assert_allclose(falsifier.margins(params, before)[0], value)
+    np.testing.assert_allclose(falsifier.reserves(params, before)[0], value)
     starts.value[:] = 7.0
     found = falsifier.search(params, rounds=0, starts=starts)
     assert found.evaluated == STARTS and found.worst == value.min()
@@ -186,21 +186,19 @@ def test_off_the_band_there_is_nothing(weak):
     params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(weak).items()}
     falsifier, domain = make(weak), weak.robot.domain
     away = np.hstack([domain.q[:, :1].T, np.array([[-4.0, 0.0, 0.5]])])
-    least, _, v = falsifier.margins(params, away)
+    least, _, v = falsifier.reserves(params, away)
     assert np.isinf(least[0]) and not v.any()
-    assert falsifier.margins(params, np.zeros((0, 5)))[0].shape == (0,)
+    assert falsifier.reserves(params, np.zeros((0, 5)))[0].shape == (0,)
 
 
-def test_states_below_a_reserve_come_back_without_counting_as_violations(two_link):
-    """``enough`` counts states that violate; the others only have less than was asked for."""
-    found = attack(two_link, rounds=4, below=0.5, enough=1)
-    assert found.worst > 0.0 and len(found.q) > 100
-    margin = make(two_link).margins
-    params = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in nothing_learned(two_link).items()}
-    domain = two_link.robot.domain
-    level = np.zeros((len(found.q), 1))
-    again = margin(params, np.concatenate([two_link.model.to_angles(found.q), found.v, level], axis=1))[0]
-    assert np.all(np.abs(found.v) <= np.abs(domain.v).max(axis=1) + 1e-9) and np.mean(again < 1.0) > 0.5
+def test_states_below_a_reserve_come_back_and_end_the_search(two_link):
+    """``enough`` and ``linger`` count them, though none violates."""
+    found, few = (attack(two_link, rounds=8, below=0.9, **ends) for ends in ({}, {"enough": 1}))
+    assert found.worst > 0.0 and len(found.q) > len(few.q) > 0
+    soon = attack(two_link, rounds=8, below=0.9, linger=2)
+    assert few.evaluated < soon.evaluated < found.evaluated
+    assert np.all(np.abs(found.v) <= np.abs(two_link.robot.domain.v).max(axis=1) + 1e-9)
+    assert reserves(two_link, found.q, found.v).max() < 0.9 + 1e-6
 
 
 def test_cornered_states_run_into_bounds_of_X(panda):

@@ -19,6 +19,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.evidence import BandCheck, check_band, uniform_band
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.learning import margin_descent as margin_descent_module
+from ppcbf_robots.learning import train as train_module
 from ppcbf_robots.learning.checkpoint import load_checkpoint, save_checkpoint
 from ppcbf_robots.learning.critics import Feasibility
 from ppcbf_robots.learning.falsifier import Attack
@@ -28,15 +29,25 @@ from ppcbf_robots.learning.margin_descent import (
     LEAST_WEIGHT,
     NEAR,
     RESERVE,
+    SLOWER,
     WEIGHT_FALL,
     WEIGHT_GROWTH,
     MarginDescent,
 )
 from ppcbf_robots.learning.paper_descent import PaperDescent
-from ppcbf_robots.learning.parameters import without_term
+from ppcbf_robots.learning.parameters import MANY_JOINTS, without_term
 from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS, Preset
 from ppcbf_robots.learning.rays import Rays
-from ppcbf_robots.learning.train import CANDIDATES, MIN_SAMPLES, Monitor, Result, Trainer, settings, with_gamma
+from ppcbf_robots.learning.train import (
+    CANDIDATES,
+    MIN_SAMPLES,
+    RESERVE_ROUNDS,
+    Monitor,
+    Result,
+    Trainer,
+    settings,
+    with_gamma,
+)
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -311,7 +322,7 @@ def test_only_rays_of_small_margin_are_explored_and_join(cartpole):
     share = descent._explore()
     added = descent.rays.select(slice(first, None))
     assert 0 < len(added) < 2 * EXPLORED
-    least = descent.band.least_margin(descent.params, added)[0]
+    least = descent.band.least_reserve(descent.params, added)
     assert torch.equal(least, descent._noted[first:])
     assert least.max() < wanted
     assert 0.0 <= share <= (least < 0.0).sum() / 10
@@ -339,7 +350,7 @@ def test_states_that_leave_an_obstacle_are_trained_on_too(two_link, monkeypatch)
     assert on.float().mean() > 0.5
     np.testing.assert_allclose(phi[on].numpy(), 0.9 * descent.epsilon, atol=1e-4)
     count, known = len(descent.rays), len(descent._crossing)
-    monkeypatch.setattr(descent.band, "least_margin", lambda params, rays: (torch.zeros(len(rays)), None))
+    monkeypatch.setattr(descent.band, "least_reserve", lambda params, rays: torch.zeros(len(rays)))
     descent.add_counterexamples(found.q.double().numpy(), found.d.double().numpy())
     descent._look()
     assert len(descent._crossing) == known
@@ -406,6 +417,25 @@ def test_the_volumes_weight_falls_with_violations_and_grows_without(two_link, mo
     assert float(descent._weight) == pytest.approx(HUMBLER * largest)
 
 
+def test_what_slows_all_motions_grows_with_every_demand_and_is_held(panda):
+    descent = margin_descent(panda)
+    for _ in range(2):
+        descent.iterate()
+    before = descent.snapshot()
+    descent.demand_more()
+    lifted = descent.snapshot()
+    for name in MANY_JOINTS:
+        a, more = (np.log1p(np.exp(p[name])) for p in (before, lifted))
+        assert more == pytest.approx(SLOWER * a, rel=1e-4)
+    assert_same_weights({k: x for k, x in lifted.items() if k not in MANY_JOINTS},
+                        {k: x for k, x in before.items() if k not in MANY_JOINTS})  # fmt: skip
+    for _ in range(3):
+        descent.iterate()
+    after = descent.snapshot()
+    assert all(after[name] == lifted[name] == descent.params[name].double().item() for name in MANY_JOINTS)
+    assert np.abs(after["Wa"] - lifted["Wa"]).max() > 0.0
+
+
 def test_a_set_without_a_band_is_told_and_does_not_crash(cartpole, monkeypatch):
     descent = margin_descent(cartpole)
     monkeypatch.setattr(descent, "_explore", lambda: 0.0)
@@ -443,19 +473,53 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
-@pytest.mark.parametrize(("worst", "rounds"), [(0.003, 2), (0.02, 1), (-0.01, 4)])
-def test_a_margin_below_the_reserve_is_worth_one_refinement(two_link, monkeypatch, worst, rounds):
-    """Clean barriers end the run, violations are refined as long as planned, and too little margin once."""
+@pytest.mark.parametrize(("worst", "rounds"), [(0.003, RESERVE_ROUNDS + 1), (0.02, 1), (-0.01, RESERVE_ROUNDS + 3)])
+def test_too_little_reserve_is_worth_some_refinements(two_link, monkeypatch, worst, rounds):
+    """Clean barriers end the run, violations are refined as long as planned, and too little reserve thrice.
+
+    What then is kept has to stand a search that goes on beyond such states.
+    """
     q, v = draw(two_link, 5, seed=2)
     found = Attack(worst, *((q, v) if worst < RESERVE else (q[:0], v[:0])), 1000)
     attacked: list[int] = []
-    monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: (attacked.append(self.planned), found)[1])
+    thoroughly: list[bool] = []
+
+    def attack(self, params, known, thorough=False):
+        attacked.append(self.planned)
+        thoroughly.append(thorough)
+        return Attack(worst, q[:0], v[:0], 5000) if thorough else found
+
+    monkeypatch.setattr(MarginDescent, "attack", attack)
     asked: list[float] = []
     monkeypatch.setattr(MarginDescent, "demand_more", lambda self: asked.append(self.margin))
-    _, result = train(two_link, dataclasses.replace(TINY, refinements=3))
+    _, result = train(two_link, dataclasses.replace(TINY, refinements=RESERVE_ROUNDS + 2))
     assert len(set(attacked)) == rounds
     assert result.converged == (worst > 0.0) and result.report()["worst_margin"] == worst
     assert len(asked) == rounds - 1
+    assert any(thoroughly) == (0.0 < worst < RESERVE)
+    assert result.report()["attacked"] == (5000 if any(thoroughly) else 1000)
+
+
+def test_what_falls_to_the_thorough_search_is_not_kept(two_link, monkeypatch):
+    """Of two that seem to stand, the one with more reserve does not; the other is the result."""
+    trainer = Trainer(two_link, "pp-ncbf", TINY)
+    q, v = draw(two_link, 1, seed=2)
+    good, bad = trainer.descent.snapshot(), {k: x + 0.0 for k, x in trainer.descent.snapshot().items()}
+    check = BandCheck(500, 0, 900)
+    tested = [train_module.Tested(p, check, Attack(w, q, v, 10), 0.9) for p, w in ((bad, 0.004), (good, 0.002))]
+
+    def attack(self, params, known, thorough):
+        return Attack(-0.01, q, v, 99) if params is bad else Attack(0.001, q[:0], v[:0], 99)
+
+    monkeypatch.setattr(MarginDescent, "attack", attack)
+    best, other = trainer._thoroughly(tested)
+    assert best.params is good and best.attack.evaluated == 99 and best.clean
+    assert other.params is bad and other.violates
+    (only,) = trainer._thoroughly(tested[:1])
+    assert only.params is bad and only.violates
+    monkeypatch.setattr(MarginDescent, "attack", lambda *a, **k: pytest.fail("no need"))
+    clean = train_module.Tested(good, check, Attack(0.02, q[:0], v[:0], 10), 0.9)
+    assert trainer._thoroughly([clean, *tested]) == [clean, *tested]
 
 
 def test_a_larger_candidate_that_failed_is_worth_one_refinement(two_link, monkeypatch):
@@ -487,7 +551,7 @@ def test_states_known_to_violate_make_a_search_needless(panda, monkeypatch):
     monkeypatch.setattr(descent.falsifier, "search", lambda *a, below, **k: (searched.append(below), known)[1])
     margins = torch.linspace(-0.2, 0.19, 40)
     monkeypatch.setattr(descent, "rays_through", lambda q, v: None)
-    monkeypatch.setattr(descent.band, "least_margin", lambda params, rays: (margins, margins))
+    monkeypatch.setattr(descent.band, "least_reserve", lambda params, rays: margins)
     found = descent.attack(params, known)
     assert not searched and found.worst == pytest.approx(-0.2) and found.evaluated == 40
     np.testing.assert_array_equal(found.q, q[:20])
@@ -646,13 +710,13 @@ def test_a_robot_that_needs_no_learned_term_is_done_at_once(two_link, cartpole, 
 
 
 def test_an_lb_barrier_of_too_little_margin_is_no_result(two_link, monkeypatch):
-    """Its search was cut short: where everything else violates, that is what comes out, and not the LB-CBF."""
+    """Its search was cut short, and a thorough one breaks it: what comes out has not converged."""
     q, v = draw(two_link, 1, seed=2)
 
-    def attack(self, *given):
-        return Attack(-0.1 if self.iteration else 0.003, q, v, 10)
+    def attack(self, params, known, thorough=False):
+        return Attack(-0.1 if self.iteration or thorough else 0.003, q, v, 10)
 
     monkeypatch.setattr(MarginDescent, "attack", attack)
     _, result = train(two_link, dataclasses.replace(TINY, judge_first=True, refinements=2))
-    assert not result.converged and result.volume_kept < 1.0
+    assert not result.converged
     assert result.attack is not None and result.attack.worst == -0.1

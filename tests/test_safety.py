@@ -97,6 +97,25 @@ def test_batch_equals_single(problem, mixed, states):
             np.testing.assert_allclose(getattr(batch, name)[i], array, atol=1e-12)
 
 
+@pytest.mark.parametrize("count", [1, 7, 1000])
+def test_the_nearest_rows_are_the_least_of_all(panda, count):
+    """In the order of ``gamma h + min(ḣ, 0)``, of pairs with obstacles and with each other, and of joint limits."""
+    model, rng, gamma = panda.model, np.random.default_rng(0), 3.0
+    safety = SafetyFunction(model, panda.robot.body, MIXED, self_pairs=[(0, 12), (1, 9)])
+    q = model.from_angles(panda.robot.domain.sample_q(rng, 40))
+    v, share = panda.robot.domain.sample_v(rng, 40), rng.uniform(0.1, 1.0, 40)
+    dyn = model.evaluate_batch(q, v)
+    rows, near = safety.evaluate(dyn), safety.nearest(dyn, gamma, share, count)
+    hdot = (rows.grad @ v[..., None])[..., 0]
+    order = np.argsort(gamma * rows.h + np.minimum(hdot, 0.0))[:, :count]
+    assert near.h.shape == (40, min(count, safety.rows))
+    for found, every in ((near.h, rows.h), (near.curvature, rows.curvature)):
+        np.testing.assert_allclose(found, np.take_along_axis(every, order, 1), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(near.grad, np.take_along_axis(rows.grad, order[..., None], 1), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(near.least_h, rows.h.min(1), rtol=1e-9)
+    np.testing.assert_allclose(near.least_rho, (share[:, None] * hdot + gamma * rows.h).min(1), rtol=1e-9)
+
+
 def test_the_papers_safety_functions(cartpole, two_link):
     h = cartpole.safety.evaluate(cartpole.model.evaluate(np.array([0.4, 1.0]), np.zeros(2))).h
     assert cartpole.safety.names[0] == "cart#0 / wall"

@@ -13,7 +13,7 @@ from ppcbf_robots.learning.rays import Field, Rays
 from ppcbf_robots.network import NetworkKind, Params
 from ppcbf_robots.problem import Problem
 
-LEVELS = (0.0, 0.5, 1.0)  # of the band's width, at which a ray's least margin is sought
+LEVELS = (0.0, 0.5, 1.0)  # of the band's width, at which a ray's least reserve is sought
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,15 @@ class Band:
         v = s[:, None] * rays.d
         return Nominal(v, rays.u_rest - self.kd * v, (self.kd * v * v).sum(-1))
 
-    def feasibility(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> Feasibility:
-        """The linear programs of the runtime QP's margin, with the passivity row or without."""
+    def feasibility(
+        self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None, free: float = 1.0
+    ) -> Feasibility:
+        """The linear programs of the runtime QP's margin, with the passivity row or without.
+
+        ``free`` is the share of the filter's free power that is made use of.
+        """
         rows, nominal = self.field.rows(params, rays, s), self.nominal(rays, s)
-        wanted, budget = self.passive if passive is None else passive, nominal.d_p + self.free_power
+        wanted, budget = self.passive if passive is None else passive, nominal.d_p + free * self.free_power
         return feasibility(rows, nominal.v, nominal.u_des, budget, self.u_max, self.config, wanted)
 
     def margin(self, params: Params, rays: Rays, s: torch.Tensor, passive: bool | None = None) -> torch.Tensor:
@@ -70,16 +75,19 @@ class Band:
         return margin
 
     @torch.no_grad()
-    def least_margin(self, params: Params, rays: Rays) -> tuple[torch.Tensor, torch.Tensor]:
-        """Least margin over the band along every ray (B,), infinite where it has none of it, and its s (B,)."""
-        least, at = torch.full_like(rays.d[:, 0], torch.inf), torch.zeros_like(rays.d[:, 0])
+    def reserve(self, params: Params, rays: Rays, s: torch.Tensor) -> torch.Tensor:
+        """Margin over capability (B,), see :meth:`ppcbf_robots.learning.critics.Feasibility.capability`."""
+        programs = self.feasibility(params, rays, s)
+        reserve: torch.Tensor = programs.margin(programs.solve()) / programs.capability()
+        return reserve
+
+    @torch.no_grad()
+    def least_reserve(self, params: Params, rays: Rays) -> torch.Tensor:
+        """Least reserve over the band along every ray (B,), infinite where it has none of it."""
+        least = torch.full_like(rays.d[:, 0], torch.inf)
         for level in LEVELS:
             s, crosses = self.field.on_band(params, rays, torch.full_like(least, self.level(level)), rising=True)
             found = crosses.nonzero()[:, 0]
-            if not len(found):
-                continue
-            margin = self.margin(params, rays.select(found), s[found])
-            lower = margin < least[found]
-            better = found[lower]
-            least[better], at[better] = margin[lower], s[better]
-        return least, at
+            if len(found):
+                least[found] = torch.minimum(least[found], self.reserve(params, rays.select(found), s[found]))
+        return least

@@ -15,6 +15,7 @@ from ppcbf_robots.filters import FilterConfig, Metric
 from ppcbf_robots.learning.linear_program import Optimum, best_worst_row
 
 _TINY = 1e-9
+LEAST_CAPABILITY = 1e-3  # two rows that brake each other exactly leave none
 PASSIVITY_RESERVE = 0.01  # of |v| |u_sc|; more of it fights the torque critic
 
 
@@ -67,6 +68,18 @@ class Feasibility(NamedTuple):
         """Multipliers and torques, without gradient."""
         offset, c, p, budget = (x.detach() for x in self)
         return best_worst_row(offset, c, p, budget.clamp(min=-1.0))
+
+    def capability(self) -> Any:
+        """(B,): the margin if no row asked for anything and power were free, without gradient.
+
+        The torque limits' effect on the rows, all together. It is 1 for a row alone, and little where one row's torques
+        are the opposite of another's, as of two joints in line that run into their limits. The *reserve*, the margin
+        over it, is the share left of what could be done, of the margin's sign: near rest, or where little can be done
+        but nothing is asked for, the margin itself is small however safe the state is.
+        """
+        offset, c, p = (x.detach() for x in (self.offset, self.c, self.p))
+        free = best_worst_row(offset.clamp(min=0.0), c, p, torch.ones_like(p[:, 0])).value
+        return free.clamp(min=LEAST_CAPABILITY).to(c.dtype)
 
     def margin(self, optimum: Optimum) -> Any:
         """(B,), with the envelope theorem's gradient: the optimum, of these very states, is held fixed."""

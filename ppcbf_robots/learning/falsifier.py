@@ -1,10 +1,12 @@
 """Search for band states without a feasible torque for the runtime filter: many small evolution strategies at once.
 
 The margin is a function of q, of the direction d of v and of the level of phi, between the filter's own margin and
-epsilon; the speed follows. It has kinks (another row, another vertex of the box), where gradients lead astray: every
-start draws points about itself instead, some in all coordinates, some in a few, and some where it last went, and moves
-to the best. Those that fall behind the others give way to fresh ones. The same number of points finds some twenty times
-as many states as differences and gradients do.
+epsilon; the speed follows. What is searched for is the least *reserve*, the margin over what the torque limits can do
+(:meth:`ppcbf_robots.learning.critics.Feasibility.capability`): the margin itself draws nearly all starts to rest, or to
+where two rows brake each other, and it is small and positive there whatever the barrier. It has kinks (another row,
+another vertex of the box), where gradients lead astray: every start draws points about itself instead, some in all
+coordinates, some in a few, and some where it last went, and moves to the best. Those that fall behind the others give
+way to fresh ones. The same number of points finds some twenty times as many states as differences and gradients do.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ CULLED = 0.33  # ... this share of the starts, those of the largest margins, is 
 class Attack:
     """What a search found."""
 
-    worst: float  # least margin seen
-    q: Array  # (found, nq) states whose margin is below what was asked for
+    worst: float  # least reserve seen
+    q: Array  # (found, nq) states whose reserve is below what was asked for
     v: Array  # (found, nv)
     evaluated: int
 
@@ -54,14 +56,14 @@ class Starts:
     """Where a search stands: B starts of n = 2 nv + 1 coordinates."""
 
     points: Array  # (B, n)
-    value: Array  # (B,) margins
+    value: Array  # (B,) reserves
     step: Array  # (B,) of X's width
     drift: Array  # (B, n) where each last went
     age: Array  # (B,) rounds
 
 
 class Falsifier:
-    """Searches for states of small margin.
+    """Searches for states of small reserve.
 
     Args:
         problem: robot, world and controller, with the gamma of the barrier.
@@ -77,8 +79,8 @@ class Falsifier:
         self._high = np.concatenate([domain.q[:, 1], domain.v[:, 1], [1.0]])
         self._width = self._high - self._low
 
-    def margins(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
-        """Margins (B,) of points (B, 2 nv + 1), infinite off the band, and their states q, v.
+    def reserves(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
+        """Reserves (B,) of points (B, 2 nv + 1), infinite off the band, and their states q, v.
 
         A point is an angle and a direction of motion for each joint, and the level of phi by its share of the band.
         """
@@ -89,16 +91,16 @@ class Falsifier:
         arrays, _, free = rays_at(self.problem, q, points[:, nv:-1], self.rows)
         device, dtype = self.band.u_max.device, self.band.u_max.dtype
         index = np.flatnonzero(free)
-        margin, v = np.full(len(points), np.inf), np.zeros((len(points), nv))
+        reserve, v = np.full(len(points), np.inf), np.zeros((len(points), nv))
         if len(index):
             rays = Rays(**to_tensors([{k: x[index] for k, x in arrays.items()}], device, dtype))
             level = torch.as_tensor(self.band.level(points[index, -1]), device=device, dtype=dtype)
             s, crosses = self.band.field.on_band(params, rays, level, rising=True)
             on = crosses.nonzero()[:, 0]
             index, chosen = index[on.cpu().numpy()], rays.select(on)
-            margin[index] = self.band.margin(params, chosen, s[on]).detach().cpu().numpy()
+            reserve[index] = self.band.reserve(params, chosen, s[on]).cpu().numpy()
             v[index] = (s[on, None] * chosen.d).cpu().numpy()
-        return margin, q, v
+        return reserve, q, v
 
     def start(self, count: int = STARTS) -> Starts:
         """No search yet: every start is replaced at once."""
@@ -114,20 +116,19 @@ class Falsifier:
         starts: Starts | None = None,
         enough: float = float("inf"),
         below: float = 0.0,
-        enough_below: float = 0.0,
         linger: float = float("inf"),
     ) -> Attack:
-        """Descend until rounds or seconds are used up, or ``enough`` states were found with less than ``enough_below``.
+        """Descend until rounds or seconds are used up, or there are ``enough`` states of a reserve less than ``below``.
 
-        It also ends ``linger`` rounds after the first of these. States of a margin less than ``below`` come back.
+        It also ends ``linger`` rounds after the first of these.
 
         ``starts`` of an earlier search, with other parameters or not, go on and are changed in place.
         """
-        began, done, first, found = time.monotonic(), 0, 1, _Found(below, enough_below)
+        began, done, first, found = time.monotonic(), 0, 1, _Found(below)
         if starts is None:
             starts = self.start()
         known = starts.step > 0.0
-        starts.value[known] = found.add(*self.margins(params, starts.points[known]))
+        starts.value[known] = found.add(*self.reserves(params, starts.points[known]))
         self._replace(params, starts, ~known, found)
         last = float("inf") if rounds is None else rounds
         while done < last and time.monotonic() - began < seconds and found.states < enough:
@@ -153,7 +154,7 @@ class Falsifier:
         if not count:
             return
         points = self._drawn(FRESH * count)
-        value = found.add(*self.margins(params, points))
+        value = found.add(*self.reserves(params, points))
         worst = np.argsort(value)[:count]
         starts.points[over], starts.value[over] = points[worst], value[worst]
         starts.step[over], starts.drift[over], starts.age[over] = FIRST_STEP, 0.0, 0
@@ -174,7 +175,7 @@ class Falsifier:
         away[:, 0] = 2.0 * starts.drift
         away[:, 1] = 0.7 * starts.drift + 0.5 * away[:, 1]
         tried = np.clip(points[:, None] + away, self._low, self._high)
-        values = found.add(*self.margins(params, tried.reshape(-1, n))).reshape(B, PROBES)
+        values = found.add(*self.reserves(params, tried.reshape(-1, n))).reshape(B, PROBES)
         start, best = np.arange(B), values.argmin(1)
         better = values[start, best] < starts.value
         moved = np.where(better[:, None], tried[start, best], points)
@@ -185,22 +186,22 @@ class Falsifier:
 
 
 class _Found:
-    """States of small margin among all that were judged."""
+    """States of small reserve among all that were judged."""
 
-    def __init__(self, below: float, counted_below: float) -> None:
-        self.below, self.counted_below, self.worst, self.judged, self.states = below, counted_below, float("inf"), 0, 0
+    def __init__(self, below: float) -> None:
+        self.below, self.worst, self.judged, self.states = below, float("inf"), 0, 0
         self._q: list[Array] = []
         self._v: list[Array] = []
 
-    def add(self, margin: Array, q: Array, v: Array) -> Array:
-        """Take note of states, and return their margins."""
-        bad = margin < self.below
-        self.worst, self.judged = min(self.worst, float(margin.min(initial=np.inf))), self.judged + len(margin)
-        self.states += int((margin < self.counted_below).sum())
+    def add(self, reserve: Array, q: Array, v: Array) -> Array:
+        """Take note of states, and return their reserves."""
+        bad = reserve < self.below
+        self.worst, self.judged = min(self.worst, float(reserve.min(initial=np.inf))), self.judged + len(reserve)
+        self.states += int(bad.sum())
         if bad.any():
             self._q.append(q[bad])
             self._v.append(v[bad])
-        return margin
+        return reserve
 
     def attack(self, nq: int, nv: int) -> Attack:
         q = np.concatenate([np.zeros((0, nq)), *self._q])

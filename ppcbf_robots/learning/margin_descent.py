@@ -1,11 +1,13 @@
 """Descent on the exact feasibility margin of the runtime QP, for the largest set that keeps it positive.
 
-The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``. The
-first term moves the set's boundary outwards along every ray v = s d, relative to its distance, so that slow motions
-weigh as much as fast ones. Of the second, half the states are drawn where the margin was small so far. The third
-keeps K from answering a violation with a steep bump in q, which would be a violation elsewhere. While nothing
-violates, the weight grows and the set with it. At every check the surroundings of the smallest margins are explored
-with new rays, and the falsifier searches beyond; both need Pinocchio, the iterations between them do not.
+The loss is ``weight E[-log s*] + E[(margin wanted - margin)₊] + simplicity E[(rate of K along the motion)²]``, where
+the margin wanted is a share of what the torque limits can do: a *reserve* is asked for, see
+:meth:`ppcbf_robots.learning.critics.Feasibility.capability`. The first term moves the set's boundary outwards along
+every ray v = s d, relative to its distance, so that slow motions weigh as much as fast ones. Of the second, half the
+states are drawn where the reserve was small so far. The third keeps K from answering a violation with a steep bump in
+q, which would be a violation elsewhere. While nothing violates, the weight grows and the set with it. At every check
+the surroundings of the smallest reserves are explored with new rays, and the falsifier searches beyond; both need
+Pinocchio, the iterations between them do not.
 """
 
 from __future__ import annotations
@@ -17,29 +19,30 @@ import torch
 
 from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
 from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
-from ppcbf_robots.learning.parameters import INSIDE, Tensors, before_softplus, without_term
+from ppcbf_robots.learning.parameters import INSIDE, MANY_JOINTS, Tensors, before_softplus, without_term
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 AVERAGING = 0.03  # of the parameters per iteration, in the average that checks and evidence look at
-NEAR = 0.1  # above the wanted margin: rays below it are drawn as often as all others together
-FAR_AWAY = 1.0  # margin noted for rays that do not cross the band
+NEAR = 0.3  # above the wanted margin: rays below it are drawn as often as all others together
+FAR_AWAY = 1.0  # reserve noted for rays that do not cross the band
 EXPLORED = 1_600  # new rays per check around those of small margin, and as many with joints that run into bounds
 SPREAD = (0.01, 0.3)  # of X's width, of the new rays about the old ones
-POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least margin
+POOL_GROWTH = 20_000  # rays kept beyond the first pool, those of least reserve
 WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration without and with violations
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
+THRIFT = 0.5  # of the power that the filter may spend freely, used in training: what is left is passivity's reserve
 MIN_MARGIN, MAX_MARGIN = 0.02, 0.3
+SLOWER = 1.5  # factor on the terms that slow all motions, per refinement; they are held then
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 HUNTING = 48  # starts of the search that goes along with training
-ENOUGH = 100  # violating states that end the evidence's search
+ENOUGH = 100  # states of too little reserve that end the evidence's search
 LINGER = 0.15  # of its rounds, that it goes on after the first of them
-FEW = 100  # states of too little margin that end that of the LB-CBF before training
-RESERVE = 5e-3  # margin that the evidence's search asks for: another search finds a little less
+RESERVE = 5e-3  # that the evidence's search asks for: another search finds a little less
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
@@ -52,15 +55,15 @@ class MarginDescent(Descent):
         super().__init__(problem, kind, preset, seed, device)
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._joints = problem.model.nv
-        self._largest_margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
-        self.margin = max(MIN_MARGIN, preset.first_margin * self._largest_margin)
+        self.margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
+        self._held: list[str] = []  # parameters that are no longer trained
         self._hunt = self.falsifier.start(HUNTING)  # goes on from check to check
         self._first_pool = len(self.rays)
         if self._violated_without_term() > MANY:
             self._begin_inside()
         self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
         self._weight: torch.Tensor = torch.tensor(self._max_weight, device=self.device)
-        self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last margin seen on each ray
+        self._noted = torch.full((len(self.rays),), torch.inf, device=self.device)  # last reserve seen on each ray
         self.judged = {k: x.detach().clone() for k, x in self.params.items()}
         self._look()
 
@@ -68,9 +71,8 @@ class MarginDescent(Descent):
     def _violated_without_term(self) -> float:
         """Share of rays that violate somewhere on the LB-CBF's band, of those that cross it."""
         params = without_term({k: x.detach().cpu().numpy() for k, x in self.params.items()})
-        least = self.band.least_margin(
-            {k: self._tensor(x) for k, x in params.items()}, self.rays.select(slice(LOOKED_AT))
-        )[0]
+        tensors = {k: self._tensor(x) for k, x in params.items()}
+        least = self.band.least_reserve(tensors, self.rays.select(slice(LOOKED_AT)))
         return float((least < 0.0).sum() / torch.isfinite(least).sum().clamp(min=1))
 
     @torch.no_grad()
@@ -81,7 +83,7 @@ class MarginDescent(Descent):
                 self.params[name].fill_(before_softplus(a))
 
     def iterate(self) -> None:
-        """A batch of band states, half of them where margins are small; one step; the weight's update."""
+        """A batch of band states, half of them where reserves are small; one step; the weight's update."""
         count = self.preset.samples
         self.set_rate()
         if not len(self._crossing):
@@ -98,18 +100,22 @@ class MarginDescent(Descent):
         rays = self.rays.select(index)
         self.evaluated += len(index)
         with torch.no_grad():
-            programs = self.band.feasibility(self.params, rays, s)
+            programs = self.band.feasibility(self.params, rays, s, free=THRIFT)
             optimum = programs.solve()
-            self._noted[index] = margin = programs.margin(optimum)
+            margin, capability = programs.margin(optimum), programs.capability()
+            wanted = self.margin * capability
+            self._noted[index] = margin / capability
         shrinkage, unrest = self._shrinkage(rays.select(slice(drawn)), s[:drawn])
         loss = self._weight * shrinkage + self._simplicity * unrest
-        short = (margin < self.margin).nonzero()[:, 0]  # the others have no gradient
+        short = (margin < wanted).nonzero()[:, 0]  # the others have no gradient
         if len(short):
-            programs = self.band.feasibility(self.params, rays.select(short), s[short])
-            wanting = torch.relu(self.margin - programs.margin(optimum.select(short)))
+            programs = self.band.feasibility(self.params, rays.select(short), s[short], free=THRIFT)
+            wanting = torch.relu(wanted[short] - programs.margin(optimum.select(short)))
             loss = loss + wanting.sum() / len(index) + self.preset.worst_weight * wanting.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
+        for name in self._held:
+            self.params[name].grad = None
         self.optimizer.step()
         self.loss = loss.detach()
         with torch.no_grad():
@@ -150,7 +156,7 @@ class MarginDescent(Descent):
 
     @torch.no_grad()
     def _look(self) -> None:
-        """Which rays leave the set through the band now, and which have band states of small margin.
+        """Which rays leave the set through the band now, and which have band states of small reserve.
 
         Rays never seen on the band are looked at, also those along which phi rises: they say nothing of the volume.
         """
@@ -160,16 +166,16 @@ class MarginDescent(Descent):
         self._crossing = leaving.nonzero()[:, 0]
         new = (crossing & torch.isinf(self._noted)).nonzero()[:, 0]
         if len(new):
-            self._noted[new] = self.band.least_margin(self.params, self.rays.select(new))[0].clamp(max=FAR_AWAY)
+            self._noted[new] = self.band.least_reserve(self.params, self.rays.select(new)).clamp(max=FAR_AWAY)
         self._near = (crossing & (self._noted < NEAR + self.margin)).nonzero()[:, 0]
 
     def _hunted(self) -> Rays:
-        """Rays on which the falsifier now sees less than the margin wanted."""
+        """Rays on which the falsifier now sees less than the reserve wanted."""
         points, nv = self._hunt.points[self._hunt.value < self.margin], self.problem.model.nv
         return self.rays_through(self.problem.model.from_angles(points[:, :nv]), points[:, nv:-1])
 
     def _explore(self) -> float:
-        """New rays about those of least margin, and where joints run into bounds; the share of them that violate."""
+        """New rays about those of least reserve, and where joints run into bounds; the share of them that violate."""
         near, count = self._near, EXPLORED // 4
         chosen = (
             near[torch.randint(len(near), (count // 2,), generator=self.generator).to(self.device)]
@@ -189,14 +195,14 @@ class MarginDescent(Descent):
         rays = self.rays_through(model.from_angles(np.clip(angles, domain.q[:, 0], domain.q[:, 1])), d)
         if not len(rays):
             return 0.0
-        least = self.band.least_margin(self.judged, rays)[0]
+        least = self.band.least_reserve(self.judged, rays)
         small = (least < NEAR + self.margin).nonzero()[:, 0]
         self._join(rays.select(small), least[small])
         return float((least < 0.0).float().mean())
 
-    def _join(self, rays: Rays, margins: torch.Tensor | None = None) -> None:
-        """New rays join the pool; beyond its growth, those of largest margin leave."""
-        noted = torch.full((len(rays),), torch.inf, device=self.device) if margins is None else margins
+    def _join(self, rays: Rays, reserves: torch.Tensor | None = None) -> None:
+        """New rays join the pool; beyond its growth, those of largest reserve leave."""
+        noted = torch.full((len(rays),), torch.inf, device=self.device) if reserves is None else reserves
         self.rays, self._noted = self.rays.join(rays), torch.cat([self._noted, noted])
         added = len(self.rays) - self._first_pool
         if added > POOL_GROWTH:
@@ -206,18 +212,17 @@ class MarginDescent(Descent):
             )
             self.rays, self._noted = self.rays.select(kept), self._noted[kept]
 
-    def attack(self, params: dict[str, Array], known: Attack | None) -> Attack:
+    def attack(self, params: dict[str, Array], known: Attack | None, thorough: bool = False) -> Attack:
         """See :meth:`Descent.attack`; states that are known and violate these parameters too make a search needless."""
         tensors = {k: self._tensor(x) for k, x in params.items()}
         if known is not None and len(known.q):
-            least = self.band.least_margin(tensors, self.rays_through(known.q, known.v))[0].cpu().numpy()
+            least = self.band.least_reserve(tensors, self.rays_through(known.q, known.v)).cpu().numpy()
             if least.min() < 0.0:
                 return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
         rounds = self.preset.attack_rounds * self._joints**2
-        enough, enough_below = (ENOUGH, 0.0) if self.iteration else (FEW, RESERVE)
-        return self.falsifier.search(
-            tensors, rounds, enough=enough, below=RESERVE, enough_below=enough_below, linger=LINGER * rounds
-        )
+        if thorough:
+            return self.falsifier.search(tensors, rounds, enough=1)
+        return self.falsifier.search(tensors, rounds, enough=ENOUGH, below=RESERVE, linger=LINGER * rounds)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""
@@ -227,26 +232,28 @@ class MarginDescent(Descent):
         self._join(self.rays_through(q, v))
 
     def demand_more(self) -> None:
-        """Larger margins and a larger share of the kinetic energy; volume weighs less, and what depends on q more."""
+        """All motions become slower, and stay so; volume weighs less, and what depends on q more.
+
+        What a search finds now and then of an arm are single spots, in states that training has never seen. To train on
+        these alone leaves others; the terms without q help everywhere.
+        """
         self._max_weight *= HUMBLER
         self._simplicity *= SIMPLER
         self._weight = self._weight.clamp(max=self._max_weight)
-        self.margin = min(self._largest_margin, 2.0 * self.margin)
-        if "energy_a" in self.params:  # what is still found then is mostly a stretched arm at full speed
-            energy = torch.nn.functional.softplus(self.judged["energy_a"])
-            lifted = torch.log(torch.expm1((2.0 * energy).clamp(min=self.preset.energy_lift)))
-            with torch.no_grad():
-                self.params["energy_a"].copy_(lifted)
-                self.judged["energy_a"].copy_(lifted)
+        self._held = [name for name in MANY_JOINTS if name in self.params]
+        for name in self._held:
+            a = SLOWER * torch.nn.functional.softplus(self.judged[name])
+            for params in (self.params, self.judged):
+                params[name].data.copy_(torch.log(torch.expm1(a)))
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        """Rays that joined and the margins noted; weights."""
+        """Rays that joined and the reserves noted; weights."""
         added = self.rays.select(slice(self._first_pool, None))
         tensors = {f"rays/{k}": x for k, x in vars(added).items()}
         tensors |= {f"judged/{k}": self.judged[k] for k in self.trained}
         tensors |= {f"hunt/{k}": torch.as_tensor(x) for k, x in vars(self._hunt).items()}
         tensors |= {"noted": self._noted, "weight": self._weight, "crossing": self._crossing, "near": self._near}
-        return tensors, {"max_weight": self._max_weight, "simplicity": self._simplicity, "margin": self.margin}
+        return tensors, {"max_weight": self._max_weight, "simplicity": self._simplicity, "held": self._held}
 
     def restore(self, tensors: Tensors, numbers: dict[str, Any]) -> None:
         """See :meth:`state`."""
@@ -261,4 +268,4 @@ class MarginDescent(Descent):
         self._noted, self._weight, self._crossing, self._near = (
             tensors[k].to(self.device) for k in ("noted", "weight", "crossing", "near")
         )
-        self._max_weight, self._simplicity, self.margin = (numbers[k] for k in ("max_weight", "simplicity", "margin"))
+        self._max_weight, self._simplicity, self._held = (numbers[k] for k in ("max_weight", "simplicity", "held"))

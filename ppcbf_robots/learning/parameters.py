@@ -12,8 +12,10 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 Tensors = dict[str, torch.Tensor]
-# Training begins next to the LB-CBF, whose set is the largest, and K grows where margins ask for it.
-CONE, BOWL = 0.005, 0.002  # [m/s], first a of the speed terms
+# Training begins next to the LB-CBF, whose set is the largest, and K grows where margins ask for it. First a [m/s] of
+# the terms that slow all motions, for robots whose X is covered by samples, and for those where more is unseen:
+FEW_JOINTS = {"cone_a": 0.005, "bowl_a": 0.002}
+MANY_JOINTS = {"cone_a": 0.02, "bowl_a": 0.03, "energy_a": 0.03}
 UNIT = -6.5  # first a of the units, before its softplus
 INSIDE = {"cone_a": 0.15, "bowl_a": 0.06, "ba": 0.05, "energy_a": 0.5}  # [m/s], each a of a set well inside the largest
 NOTHING = -40.0  # any a, before its softplus, of a K that is zero to rounding
@@ -46,12 +48,11 @@ def initial_parameters(problem: Problem, preset: Preset, energy: float, generato
     nv, units = problem.model.nv, preset.units
     p["v_scale"] = 1.0 / v_max
     mean_square = nv / 3.0  # of |v / v_max| over X
-    for form, a, b, c in (("cone", CONE, 1.0, 0.05), ("bowl", BOWL, math.sqrt(5.0 / mean_square), 5.0)):
-        c = c if form == "bowl" else before_softplus(c)
-        p[f"{form}_a"], p[f"{form}_c"] = (torch.tensor(x, dtype=torch.float64) for x in (before_softplus(a), c))
-        p[f"{form}_b"] = torch.full((nv,), b, dtype=torch.float64)
-    if nv > preset.covered_joints:
-        p["energy_a"] = torch.tensor(before_softplus(preset.energy), dtype=torch.float64)
+    for form, b, c in (("cone", 1.0, before_softplus(0.05)), ("bowl", math.sqrt(5.0 / mean_square), 5.0)):
+        p[f"{form}_b"], p[f"{form}_c"] = torch.full((nv,), b, dtype=torch.float64), torch.tensor(c, dtype=torch.float64)
+    for name, a in (MANY_JOINTS if nv > preset.covered_joints else FEW_JOINTS).items():
+        p[name] = torch.tensor(before_softplus(a), dtype=torch.float64)
+    if "energy_a" in p:
         p["energy_scale"] = torch.tensor(1.0 / energy, dtype=torch.float64)
     p["Wa"], p["ba"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), UNIT, dtype=torch.float64)
     p["Wc"], p["bc"] = 0.1 * _linear(width, units, generator)[0], torch.full((units,), -1.0, dtype=torch.float64)

@@ -192,21 +192,15 @@ def rays_at(
     problem: Problem, q: Array, v: Array, rows: int, goal_angles: Array | None = None
 ) -> tuple[RayArrays, Array, Array]:
     """Rays through B states (q, v), the states' least rho (B,), and whether each is free of collision (B,)."""
-    gamma = problem.robot.spec.barrier.gamma
-    d = _to_face(v, problem.robot.domain.v)
+    d, share = _to_face(v, problem.robot.domain.v)
     dyn = problem.model.evaluate_batch(q, d)
-    safety = problem.safety.evaluate(dyn)
-    hdot = (safety.grad @ d[..., None])[..., 0]
-    nearest = np.argsort(gamma * safety.h + np.minimum(hdot, 0.0), axis=-1)[:, :rows]
-    pick = np.take_along_axis
+    near = problem.safety.nearest(dyn, problem.robot.spec.barrier.gamma, share, rows)
     rays = {
         "q": q, "d": d, "Minv": dyn.Minv, "g": dyn.g, "beta": dyn.Cv, "Md": (dyn.M @ d[..., None])[..., 0],
-        "h": pick(safety.h, nearest, -1), "eta": pick(safety.curvature, nearest, -1),
-        "grad": pick(safety.grad, nearest[..., None], -2),
+        "h": near.h, "eta": near.curvature, "grad": near.grad,
         "u_rest": problem.robot.controller.u_rest(q, dyn.g, goal_angles),
     }  # fmt: skip
-    rho = ((safety.grad @ v[..., None])[..., 0] + gamma * safety.h).min(axis=-1)
-    return rays, rho, safety.h.min(axis=-1) >= 0.0
+    return rays, near.least_rho, np.asarray(near.least_h >= 0.0)
 
 
 def to_tensors(parts: list[RayArrays], device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
@@ -214,8 +208,8 @@ def to_tensors(parts: list[RayArrays], device: torch.device, dtype: torch.dtype)
     return {k: torch.as_tensor(np.concatenate([p[k] for p in parts]), device=device, dtype=dtype) for k in parts[0]}
 
 
-def _to_face(v: Array, box: Array) -> Array:
-    """Scale every v (B, nv) outwards until it touches the box (nv, 2)."""
+def _to_face(v: Array, box: Array) -> tuple[Array, Array]:
+    """Every v (B, nv) scaled outwards until it touches the box (nv, 2), and the share (B,) of that which v is."""
     limit = np.where(v >= 0.0, box[:, 1], box[:, 0])
-    reach = np.max(v / limit, axis=1, keepdims=True)
-    return np.asarray(v / np.maximum(reach, 1e-9))
+    share = np.maximum(np.max(v / limit, axis=1), 1e-9)
+    return v / share[:, None], share
