@@ -75,12 +75,8 @@ class Descent(ABC):
         """What is asked for becomes stricter, since the evidence found violations."""
 
     @abstractmethod
-    def attack(self, params: dict[str, Array], known: Attack | None, thorough: bool = False) -> Attack | None:
-        """A search for states of too little reserve of given parameters; None where there is none.
-
-        ``known``: what a search found of others. Where there are such states it ends soon, unless it is ``thorough``:
-        then it goes on until a state violates.
-        """
+    def attack(self, params: dict[str, Array], known: Attack | None) -> Attack | None:
+        """A search for violating states of given parameters, with those known of others; None where there is none."""
 
     @abstractmethod
     def state(self) -> tuple[Tensors, dict[str, Any]]:

@@ -36,13 +36,12 @@ LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
 THRIFT = 0.5  # of the power that the filter may spend freely, used in training: what is left is passivity's reserve
 MIN_MARGIN, MAX_MARGIN = 0.02, 0.3
-SLOWER = 1.5  # factor on the terms that slow all motions, per refinement; they are held then
+SLOWER = 1.25  # factor on the terms that slow all motions, per refinement; they are held then
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 HUNTING = 48  # starts of the search that goes along with training
-ENOUGH = 100  # states of too little reserve that end the evidence's search
+ENOUGH = 100  # violating states that end the evidence's search
 LINGER = 0.15  # of its rounds, that it goes on after the first of them
-RESERVE = 5e-3  # that the evidence's search asks for: another search finds a little less
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
@@ -212,17 +211,15 @@ class MarginDescent(Descent):
             )
             self.rays, self._noted = self.rays.select(kept), self._noted[kept]
 
-    def attack(self, params: dict[str, Array], known: Attack | None, thorough: bool = False) -> Attack:
+    def attack(self, params: dict[str, Array], known: Attack | None) -> Attack:
         """See :meth:`Descent.attack`; states that are known and violate these parameters too make a search needless."""
         tensors = {k: self._tensor(x) for k, x in params.items()}
         if known is not None and len(known.q):
             least = self.band.least_reserve(tensors, self.rays_through(known.q, known.v)).cpu().numpy()
             if least.min() < 0.0:
                 return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
-        rounds = self.preset.attack_rounds * self._joints**2
-        if thorough:
-            return self.falsifier.search(tensors, rounds, enough=1)
-        return self.falsifier.search(tensors, rounds, enough=ENOUGH, below=RESERVE, linger=LINGER * rounds)
+        rounds = self.preset.attack_rounds * self._joints
+        return self.falsifier.search(tensors, rounds, enough=ENOUGH, linger=LINGER * rounds)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""

@@ -98,7 +98,7 @@ class PaperDescent(Descent):
         self.rays = self.rays.join(found.select(copies))
         self._counterexamples.append((q, v))
 
-    def attack(self, params: dict[str, Array], known: Attack | None, thorough: bool = False) -> Attack | None:
+    def attack(self, params: dict[str, Array], known: Attack | None) -> Attack | None:
         """The closed form has no margin to descend on."""
         return None
 

@@ -23,7 +23,6 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
-RESERVE_ROUNDS = 1  # refinements that states of too little reserve are worth, where none violates
 GAIN_ROUNDS = 1  # refinements that a larger set is worth, where a smaller one stands
 CANDIDATES = 3  # clean parameter sets tried by the evidence
 APART = 5e-3  # of the LB set's volume, by which they differ at least: what is wrong with one is so with its like
@@ -92,25 +91,19 @@ class Tested:
     volume_kept: float
 
     @property
-    def violates(self) -> bool:
-        """Whether a state was found that has no feasible torque."""
-        return self.check.violations > 0 or (self.attack is not None and self.attack.worst < 0.0)
-
-    @property
-    def stands(self) -> bool:
-        """Whether there were states and none was seen to violate, though some may come too close to it."""
-        return self.check.samples > 0 and not self.violates
-
-    @property
     def clean(self) -> bool:
-        """Whether there were states and none violates or comes close to it."""
-        return self.stands and (self.attack is None or not len(self.attack.q))
+        """Whether there were states and none was seen to violate."""
+        return self.check.samples > 0 and not self.check.violations and self.worst >= 0.0
+
+    @property
+    def worst(self) -> float:
+        """The falsifier's least reserve; infinite where it did not search."""
+        return np.inf if self.attack is None else self.attack.worst
 
     @property
     def order(self) -> tuple[float, ...]:
-        """The least is the best: it stands, is clean, has few violations, much reserve, and is large."""
-        worst = np.inf if self.attack is None else self.attack.worst
-        return self.violates, not self.clean, self.check.violations, -worst, -self.volume_kept
+        """The least is the best: clean and large; else with few violations, and the least of them small."""
+        return (False, -self.volume_kept) if self.clean else (True, self.check.violations, -self.worst)
 
 
 class Trainer:
@@ -164,14 +157,11 @@ class Trainer:
                     self._descend(on_check, time_limit)
             except KeyboardInterrupt:
                 interrupted = True
-            found: list[Tested] = []
             try:
                 found = self._evidence()
-                tested = sorted([*tested, *found], key=lambda t: t.order)
-                if round_ >= RESERVE_ROUNDS:
-                    tested = self._thoroughly(tested)
             except KeyboardInterrupt:
-                interrupted = True
+                found, interrupted = [], True
+            tested = sorted([*tested, *found], key=lambda t: t.order)
             out_of_time = time.monotonic() - self.started > time_limit
             enough = bool(tested) and tested[0].clean
             gained += enough
@@ -186,26 +176,8 @@ class Trainer:
             if on_refine is not None:
                 wrong = _said(found[0]) if found else "no clean barrier"
                 on_refine(f"{wrong}: refining{', for a larger set than the one that stands' if enough else ''}")
-        try:
-            tested = self._thoroughly(tested)
-        except KeyboardInterrupt:
-            tested, interrupted = [], True
         best = tested[0] if tested else Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
         return self._result(best, interrupted)
-
-    def _thoroughly(self, tested: list[Tested]) -> list[Tested]:
-        """In order, after those that stand with too little reserve were searched for violations, until one is clean."""
-        judged: list[Tested] = []
-        for i, t in enumerate(tested):
-            if t.stands and not t.clean:
-                t = dataclasses.replace(t, attack=self.descent.attack(t.params, None, thorough=True))
-                if t.violates:
-                    self._join([t])
-            judged.append(t)
-            if t.clean:
-                judged += tested[i + 1 :]
-                break
-        return sorted(judged, key=lambda t: t.order)
 
     def _descend(self, on_check: Callable[[Monitor], None] | None, time_limit: float) -> None:
         """Lines 2 to 12 of Algorithm 1."""
@@ -263,7 +235,7 @@ class Trainer:
                 check = self._draw_check(params, self.preset.test_samples)
             if check.samples:
                 tested.append(Tested(params, check, attack, volume))
-            if tested and tested[-1].stands:  # smaller ones can only be cleaner, which a refinement is better for
+            if tested and tested[-1].clean:  # smaller ones can only be cleaner, which a refinement is better for
                 break
         return tested
 
