@@ -213,7 +213,7 @@ def _print(report: dict[str, Any]) -> None:
     if report["worst_margin"] is not None:
         what = "no state" if report["worst_margin"] >= 0.0 else "states"
         out.print(
-            f"the falsifier found {what} without a feasible torque; least margin {report['worst_margin']:.4f} "
+            f"the falsifier found {what} without a feasible torque; least reserve {report['worst_margin']:.4f} "
             f"of {report['attacked']} tried"
         )
     out.print(f"wrote {report['out']}/barrier.json and {report['out']}/weights.safetensors")

@@ -90,7 +90,7 @@ def _training(m: Material) -> Section:
     ]
     if training.get("worst_margin") is not None:
         text.append(
-            f"The falsifier's least feasibility margin is {training['worst_margin']:.4f} "
+            f"The falsifier's least reserve is {training['worst_margin']:.4f} "
             f"in {training.get('attacked', '?')} states; below 0 there is no feasible torque."
         )
     history = training.get("history") or []
@@ -130,7 +130,7 @@ def _certificate(m: Material) -> Section:
         return Section("certificate", "Certificate", [f"Not verified: run ppcbf verify {m.folder}"])
     rows = [[name, c.statement, c.verdict, _certainty(c.verdict, vars(c)), _number(c.worst_margin)]
             for name, c in found.conditions.items()]  # fmt: skip
-    table = Table("Conditions", ["condition", "what it says", "verdict", "how certain", "least margin"], rows)
+    table = Table("Conditions", ["condition", "what it says", "verdict", "how certain", "least reserve"], rows)
     text = [VERDICTS[found.verdict][1], f"Found by {found.method} in {_seconds(found.seconds)}."]
     if found.method == "samples":
         without, tried = found.details.get("no_attack"), found.details.get("attacked", 0)

@@ -461,7 +461,7 @@ def test_a_candidate_that_the_falsifier_breaks_is_not_converged(two_link, monkey
     monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: (calls.append(1), real)[1])
     _, result = train(two_link, on_refine=lambda note: (notes.append(note), tried.append(len(calls))))
     assert not result.converged
-    assert result.reason == "the falsifier found states of too little margin, the least -0.2500"
+    assert result.reason == "the falsifier found violating states, of a reserve of -0.2500 at least"
     assert notes == [f"{result.reason}: refining"]
     (states,) = filter(None, joined)  # at the refinement, and none at the checks
     assert 1 <= tried[0] <= CANDIDATES and states == 7 * tried[0]
@@ -498,7 +498,7 @@ def test_a_larger_candidate_that_failed_is_worth_one_refinement(two_link, monkey
     seen: list[Any] = []
     result = trainer.run(lambda monitor: seen.append(trainer.descent.snapshot()), on_refine=notes.append)
     assert notes == [
-        "the falsifier found states of too little margin, the least -0.1000: refining, "
+        "the falsifier found violating states, of a reserve of -0.1000 at least: refining, "
         "for a larger set than the one that stands"
     ]
     assert result.converged and result.attack is not None and result.attack.worst == 0.02

@@ -290,7 +290,7 @@ def _said(tested: Tested) -> str:
     check, attack = tested.check, tested.attack
     if check.violations or attack is None:
         return f"{check.violations} of {check.samples} uniform band states violate the limits"
-    return f"the falsifier found states of too little margin, the least {attack.worst:.4f}"
+    return f"the falsifier found violating states, of a reserve of {attack.worst:.4f} at least"
 
 
 def with_gamma(problem: Problem, preset: Preset) -> Problem:
