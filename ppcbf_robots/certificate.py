@@ -37,7 +37,7 @@ class Condition:
     confidence: float | None = None  # of a bound that is not proved
     samples: int | None = None
     violations: int | None = None  # among the samples, or states known in all
-    worst_margin: float | None = None  # the attack's least reserve: margin over what the torque limits can do
+    worst_margin: float | None = None  # the attack's least reserve
 
 
 @dataclass(frozen=True)

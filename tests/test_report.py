@@ -80,7 +80,8 @@ def test_report_says_what_is_known(trained, tmp_path, browser, monkeypatch, caps
     text = re.sub(r"\s+", " ", browser.evaluate("document.body.innerText"))
     for expected in (
         "two_link in circle", "Training did not converge (stopped <early>) after 40 iterations",
-        "keeps 94.0% of that of the untrained LB-CBF", "3 of 1000 uniform states", "least reserve is -0.2500 in 500 states",
+        "keeps 94.0% of that of the untrained LB-CBF", "3 of 1000 uniform states",
+        "least reserve is -0.2500 in 500 states",
         "Refuted: states are known", "at most 0.00015 of the band, with 99.9 % confidence (2 of 69,075 samples)",
         "7 violating states known", "A search tried 500,000: some",
         "(0 of 69,075 samples), and at states that are known",
