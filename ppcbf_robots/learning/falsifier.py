@@ -46,7 +46,7 @@ class Attack:
     """What a search found."""
 
     worst: float  # least reserve seen
-    q: Array  # (found, nq) states whose reserve is below what was asked for
+    q: Array  # (found, nq) states that violate
     v: Array  # (found, nv)
     evaluated: int
 
@@ -115,16 +115,15 @@ class Falsifier:
         seconds: float = float("inf"),
         starts: Starts | None = None,
         enough: float = float("inf"),
-        below: float = 0.0,
         linger: float = float("inf"),
     ) -> Attack:
-        """Descend until rounds or seconds are used up, or there are ``enough`` states of a reserve less than ``below``.
+        """Descend until rounds or seconds are used up, or ``enough`` violating states were found.
 
         It also ends ``linger`` rounds after the first of these.
 
         ``starts`` of an earlier search, with other parameters or not, go on and are changed in place.
         """
-        began, done, first, found = time.monotonic(), 0, 1, _Found(below)
+        began, done, first, found = time.monotonic(), 0, 1, _Found()
         if starts is None:
             starts = self.start()
         known = starts.step > 0.0
@@ -143,7 +142,7 @@ class Falsifier:
                 old = np.flatnonzero(starts.age >= CULLING)
                 behind = old[np.argsort(-starts.value[old])][: int(CULLED * len(starts.value))]
                 over[behind] = True
-                over[old[starts.value[old] < below]] = True  # elsewhere there may be others
+                over[old[starts.value[old] < 0.0]] = True  # elsewhere there may be others
             self._replace(params, starts, over, found)
         return found.attack(self.problem.model.nq, self.problem.model.nv)
 
@@ -186,16 +185,16 @@ class Falsifier:
 
 
 class _Found:
-    """States of small reserve among all that were judged."""
+    """Violating states among all that were judged."""
 
-    def __init__(self, below: float) -> None:
-        self.below, self.worst, self.judged, self.states = below, float("inf"), 0, 0
+    def __init__(self) -> None:
+        self.worst, self.judged, self.states = float("inf"), 0, 0
         self._q: list[Array] = []
         self._v: list[Array] = []
 
     def add(self, reserve: Array, q: Array, v: Array) -> Array:
         """Take note of states, and return their reserves."""
-        bad = reserve < self.below
+        bad = reserve < 0.0
         self.worst, self.judged = min(self.worst, float(reserve.min(initial=np.inf))), self.judged + len(reserve)
         self.states += int(bad.sum())
         if bad.any():

@@ -35,7 +35,7 @@ WEIGHT_GROWTH, WEIGHT_FALL = 1.01, 0.95  # of the volume's weight, per iteration
 LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
 THRIFT = 0.5  # of the power that the filter may spend freely, used in training: what is left is passivity's reserve
-MIN_MARGIN, MAX_MARGIN = 0.02, 0.3
+MIN_MARGIN = 0.02
 SLOWER = 1.25  # factor on the terms that slow all motions, per refinement; they are held then
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
@@ -54,7 +54,7 @@ class MarginDescent(Descent):
         super().__init__(problem, kind, preset, seed, device)
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._joints = problem.model.nv
-        self.margin = float(np.clip(preset.margin * (self._joints - 1), MIN_MARGIN, MAX_MARGIN))
+        self.margin = max(MIN_MARGIN, preset.margin * (self._joints - 1))
         self._held: list[str] = []  # parameters that are no longer trained
         self._hunt = self.falsifier.start(HUNTING)  # goes on from check to check
         self._first_pool = len(self.rays)
@@ -238,10 +238,11 @@ class MarginDescent(Descent):
         self._simplicity *= SIMPLER
         self._weight = self._weight.clamp(max=self._max_weight)
         self._held = [name for name in MANY_JOINTS if name in self.params]
-        for name in self._held:
-            a = SLOWER * torch.nn.functional.softplus(self.judged[name])
-            for params in (self.params, self.judged):
-                params[name].data.copy_(torch.log(torch.expm1(a)))
+        with torch.no_grad():
+            for name in self._held:
+                a = SLOWER * float(torch.nn.functional.softplus(self.judged[name]))
+                for params in (self.params, self.judged):
+                    params[name].fill_(before_softplus(a))
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
         """Rays that joined and the reserves noted; weights."""

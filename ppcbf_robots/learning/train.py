@@ -93,17 +93,14 @@ class Tested:
     @property
     def clean(self) -> bool:
         """Whether there were states and none was seen to violate."""
-        return self.check.samples > 0 and not self.check.violations and self.worst >= 0.0
-
-    @property
-    def worst(self) -> float:
-        """The falsifier's least reserve; infinite where it did not search."""
-        return np.inf if self.attack is None else self.attack.worst
+        survived = self.attack is None or self.attack.worst >= 0.0
+        return self.check.samples > 0 and not self.check.violations and survived
 
     @property
     def order(self) -> tuple[float, ...]:
-        """The least is the best: clean and large; else with few violations, and the least of them small."""
-        return (False, -self.volume_kept) if self.clean else (True, self.check.violations, -self.worst)
+        """The least is the best: clean and large; else with few violating states, found in either way, and large."""
+        failures = self.check.violations + (0 if self.attack is None else len(self.attack.q))
+        return not self.clean, failures, -self.volume_kept
 
 
 class Trainer:
@@ -161,7 +158,11 @@ class Trainer:
                 found = self._evidence()
             except KeyboardInterrupt:
                 found, interrupted = [], True
-            tested = sorted([*tested, *found], key=lambda t: t.order)
+            if round_ < 0:  # where the LB-CBF is not clean, its search was cut short
+                tested = [t for t in found if t.clean]
+            else:
+                tested += found
+            tested = sorted(tested, key=lambda t: t.order)
             out_of_time = time.monotonic() - self.started > time_limit
             enough = bool(tested) and tested[0].clean
             gained += enough
