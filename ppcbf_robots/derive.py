@@ -11,13 +11,16 @@ from ppcbf_robots.specs import Array, ControllerSpec, DomainSpec, per_joint
 
 SAMPLES = 1000  # configurations over which gravity and inertia are bounded; with 200 rare light postures are missed
 SAMPLE_SEED = 0
-DAMPING_SHARE = 0.5  # of the torque left beside gravity, taken by damping at the fastest velocity of X
-SPRING_SHARE = 0.3  # of what then is left, taken by the spring; with all of it hardly a torque is passive that brakes
+DAMPING_SHARE = 0.3  # of the torque left beside gravity, taken by damping at the fastest velocity of X
+SPRING_SHARE = 0.1  # of what then is left, taken by the spring; with all of it hardly a torque is passive that brakes
+DAMPING_RATE = 20.0  # [1/s], of the mean joint inertia, at most: light joints need no more
+SPRING_TIME = 0.15  # [s], in which the spring alone may bring the mean joint inertia to full speed, at least
 SPRING_RATE = 4.0  # [1/s], K_p / K_d: the rate at which a heavily damped joint closes its error
 DT = 1e-3  # [s], control period the derived damping must suit
 DAMPING_LIMIT = 0.7  # of λ_max(M⁻¹ K_d) dt; 1 would overshoot within one period
 WIDE_TURN = np.pi  # [rad], half range given to joints without position limits
 CORNERED = 0.25  # of the joints run into a bound, in states drawn so
+FAST = 0.7  # of its full speed, at which such a joint moves at least, in half of these states
 CLOSE = 1.5  # times |v| / gamma: the largest distance from it
 
 
@@ -38,13 +41,16 @@ class Domain:
     def sample_cornered(self, rng: np.random.Generator, count: int, gamma: float) -> tuple[Array, Array]:
         """States, angles and velocities (count, nv) each, of which some joints run into a bound of X.
 
-        Every joint does with a probability of 1/4, so close to its bound that ``gamma h + ḣ`` is small; the rest is
-        uniform. Several rows meet there more often than at uniform states.
+        Every joint does with a probability of 1/4, so close to its bound that ``gamma h + ḣ`` is small, and in half of
+        the states at 0.7 of its full speed or more; the rest is uniform. Several rows meet there more often than at
+        uniform states, and torque runs short where fast ones do.
         """
         q, v = self.sample_q(rng, count), self.sample_v(rng, count)
+        near = rng.random(q.shape) < CORNERED
+        fast = rng.uniform(FAST, 1.0, q.shape) * np.where(v >= 0.0, self.v[:, 1], self.v[:, 0])
+        v = np.where(near & (rng.random((count, 1)) < 0.5), fast, v)
         bound = np.where(v >= 0.0, self.q[:, 1], self.q[:, 0])
         close = bound - rng.uniform(0.0, CLOSE, q.shape) * v / gamma
-        near = rng.random(q.shape) < CORNERED
         return np.where(near, np.clip(close, self.q[:, 0], self.q[:, 1]), q), v
 
 
@@ -65,10 +71,12 @@ def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
 def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain) -> Gains:
     """Given gains, else a well damped bounded spring that fits beside gravity in the torque box.
 
-    Damping at the fastest velocity of X takes half of the torque beside gravity, less where ``λ_max(M⁻¹ K_d) dt``
-    would exceed 0.7 over sampled configurations; the spring is as stiff as a damping ratio of 0.5 on the mean joint
-    inertia allows, and its bound leaves room for gravity, damping and the filter: where gravity, spring and a barrier
-    each want nearly all of a joint, no barrier is passive.
+    Damping at the fastest velocity of X takes 0.3 of the torque beside gravity, less where ``λ_max(M⁻¹ K_d) dt`` would
+    exceed 0.7 over sampled configurations, and no more than ``20/s`` of the mean joint inertia. The spring is as stiff
+    as a damping ratio of 0.5 on that inertia allows. Its bound leaves room for gravity, damping and the filter, and
+    suits the inertia too: whatever takes over from a stretching spring must, to be passive, take out the power that
+    the spring would. The motors of a wrist, by their torque alone, would have springs of thousands of rad/s², whose
+    power only the joints below could take out, while they hold the arm off a limit.
     """
     spec = spec or ControllerSpec()
     rng = np.random.default_rng(SAMPLE_SEED)
@@ -87,12 +95,13 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
         )
     fastest = np.abs(domain.v).max(axis=1)
     room = np.maximum(robot.u_max - g_max, 0.05 * robot.u_max)
-    kd = _stable_damping(DAMPING_SHARE * room / fastest, Minvs)
+    kd = _stable_damping(np.minimum(DAMPING_SHARE * room / fastest, DAMPING_RATE * inertia), Minvs)
     kp = np.minimum(SPRING_RATE * kd, kd**2 / inertia)
     names = robot.joint_names
     kp = kp if spec.kp is None else per_joint(spec.kp, names, "controller.kp", kp)
     kd = kd if spec.kd is None else per_joint(spec.kd, names, "controller.kd", kd)
     f_max = SPRING_SHARE * np.maximum(robot.u_max - g_max - kd * fastest, 0.05 * robot.u_max)
+    f_max = np.minimum(f_max, inertia * fastest / SPRING_TIME)
     f_max = f_max if spec.max_spring is None else per_joint(spec.max_spring, names, "controller.max_spring", f_max)
     for what, values, least in (("kp", kp, 0.0), ("kd", kd, 0.0), ("max_spring", f_max, 1e-9)):
         if np.any(values < least):

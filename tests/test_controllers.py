@@ -7,6 +7,7 @@ import pytest
 
 from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.derive import derive_gains
+from ppcbf_robots.problem import load_robot
 
 KINDS = ["pd_gravity", "shaping", "bounded_spring"]
 DT = 1e-3  # [s], control period the derived gains must suit
@@ -99,6 +100,19 @@ def test_derived_gains_fit_the_torque_box_and_the_control_period(problems, state
         dyn = model.evaluate(q, v)
         assert np.all(np.abs(controller.evaluate(dyn).u) <= 1.02 * model.u_max)
         assert np.abs(np.linalg.eigvals(dyn.Minv * kd)).max() * DT < 1.0
+
+
+@pytest.mark.parametrize("name", ["panda", "kinova", "xarm7"])
+def test_derived_springs_suit_the_inertia(name):
+    """No spring alone takes its joint to full speed faster than in 0.15 s, and no damper is faster than 20/s."""
+    robot = load_robot(name)
+    model, gains, domain = robot.model, robot.controller.gains, robot.domain
+    drawn = model.from_angles(domain.sample_q(np.random.default_rng(5), 2000))
+    inertia = np.mean([np.diag(model.evaluate(q, np.zeros(model.nv)).M) for q in drawn], axis=0)
+    times = inertia * np.abs(domain.v).max(axis=1) / gains.max_spring
+    assert times.min() >= 0.15 * 0.9
+    assert (gains.kd / inertia).max() <= 20.0 * 1.1
+    assert times.min() <= 0.15 * 1.1  # a wrist's: the torque alone would allow far more
 
 
 def test_rest_torque_is_the_torque_at_rest(problem, controller, states):

@@ -202,12 +202,15 @@ def test_violating_states_come_back_and_end_the_search(weak):
 
 
 def test_cornered_states_run_into_bounds_of_X(panda):
-    """A quarter of the joints are within 1.5 |v| / gamma of the bound they move to; all stay in X."""
+    """A quarter of the joints are within 1.5 |v| / gamma of the bound they move to, half of those fast; all in X."""
     domain, gamma = panda.robot.domain, 4.0
     q, v = domain.sample_cornered(np.random.default_rng(0), 20_000, gamma)
     for x, box in ((q, domain.q), (v, domain.v)):
         assert np.all((x >= box[:, 0]) & (x <= box[:, 1]))
     distance = np.where(v >= 0.0, domain.q[:, 1] - q, q - domain.q[:, 0])
-    by_chance = np.minimum(1.0, 1.5 * np.abs(v) / gamma / np.ptp(domain.q, axis=1))
+    uniform = domain.sample_v(np.random.default_rng(1), 20_000)
+    by_chance = np.minimum(1.0, 1.5 * np.abs(uniform) / gamma / np.ptp(domain.q, axis=1))
     close = np.mean(distance <= 1.5 * np.abs(v) / gamma + 1e-12, axis=0)
     np.testing.assert_allclose(close, 0.25 + 0.75 * by_chance.mean(axis=0), atol=0.02)
+    fast = np.mean(np.abs(v) >= 0.7 * np.abs(domain.v).max(axis=1), axis=0)
+    np.testing.assert_allclose(fast, 0.3 + 0.25 * 0.5 * 0.7, atol=0.02)

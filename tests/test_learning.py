@@ -33,7 +33,7 @@ from ppcbf_robots.learning.margin_descent import (
     MarginDescent,
 )
 from ppcbf_robots.learning.paper_descent import PaperDescent
-from ppcbf_robots.learning.parameters import MANY_JOINTS, without_term
+from ppcbf_robots.learning.parameters import HELD, INSIDE, MANY_JOINTS, without_term
 from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS, Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.learning.train import (
@@ -41,6 +41,7 @@ from ppcbf_robots.learning.train import (
     MIN_SAMPLES,
     Monitor,
     Result,
+    Tested,
     Trainer,
     settings,
     with_gamma,
@@ -431,6 +432,27 @@ def test_what_slows_all_motions_grows_with_every_demand_and_is_held(panda):
     after = descent.snapshot()
     assert all(after[name] == lifted[name] == descent.params[name].double().item() for name in MANY_JOINTS)
     assert np.abs(after["Wa"] - lifted["Wa"]).max() > 0.0
+
+
+def test_the_share_of_the_energy_is_not_trained_unless_training_begins_inside(panda, monkeypatch):
+    def trained() -> float:
+        descent = margin_descent(panda)
+        for _ in range(2):
+            descent.iterate()
+        return float(np.log1p(np.exp(descent.params[HELD].double().item())))
+
+    assert trained() == pytest.approx(MANY_JOINTS[HELD], rel=1e-5)
+    monkeypatch.setattr(MarginDescent, "_violated_without_term", lambda self: 1.0)
+    assert trained() != pytest.approx(INSIDE[HELD], rel=1e-5)
+
+
+def test_the_lb_barrier_of_an_arm_stands_only_with_the_reserve_that_training_asks_for(panda, two_link):
+    check, none = BandCheck(10, 0, 10), np.zeros((0, 7))
+    for problem, enough in ((panda, False), (two_link, True)):
+        trainer = Trainer(problem, "pp-ncbf", TINY)
+        margin = trainer.descent.margin
+        for worst, stands in ((1.1 * margin, True), (0.5 * margin, enough)):
+            assert trainer._has_reserve(Tested({}, check, Attack(worst, none, none, 10), 1.0)) is stands
 
 
 def test_a_set_without_a_band_is_told_and_does_not_crash(cartpole, monkeypatch):

@@ -19,7 +19,7 @@ import torch
 
 from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
 from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
-from ppcbf_robots.learning.parameters import INSIDE, MANY_JOINTS, Tensors, before_softplus, without_term
+from ppcbf_robots.learning.parameters import HELD, INSIDE, MANY_JOINTS, Tensors, before_softplus, without_term
 from ppcbf_robots.learning.presets import Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
@@ -36,7 +36,7 @@ LEAST_WEIGHT = 0.05  # of the largest
 VIOLATED = 5e-4  # share of violations in a batch above which the weight falls
 THRIFT = 0.5  # of the power that the filter may spend freely, used in training: what is left is passivity's reserve
 MIN_MARGIN = 0.02
-SLOWER = 1.25  # factor on the terms that slow all motions, per refinement; they are held then
+SLOWER = 1.5  # factor on the terms that slow all motions, per refinement; they are held then
 SIMPLER = 1.25  # factor on the penalty of what depends on q, per refinement
 TAKEN = 300  # states at most that join from one search
 HUNTING = 48  # starts of the search that goes along with training
@@ -55,7 +55,7 @@ class MarginDescent(Descent):
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._joints = problem.model.nv
         self.margin = max(MIN_MARGIN, preset.margin * (self._joints - 1))
-        self._held: list[str] = []  # parameters that are no longer trained
+        self._held = [name for name in self.params if name == HELD]  # parameters that are not, or no longer, trained
         self._hunt = self.falsifier.start(HUNTING)  # goes on from check to check
         self._first_pool = len(self.rays)
         if self._violated_without_term() > MANY:
@@ -76,7 +76,8 @@ class MarginDescent(Descent):
 
     @torch.no_grad()
     def _begin_inside(self) -> None:
-        """A K so large that the set begins well inside the largest one."""
+        """A K so large that the set begins well inside the largest one; all of it is trained."""
+        self._held = []
         for name, a in INSIDE.items():
             if name in self.params:
                 self.params[name].fill_(before_softplus(a))
@@ -218,7 +219,7 @@ class MarginDescent(Descent):
             least = self.band.least_reserve(tensors, self.rays_through(known.q, known.v)).cpu().numpy()
             if least.min() < 0.0:
                 return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
-        rounds = self.preset.attack_rounds * self._joints
+        rounds = self.preset.attack_rounds * max(1, self._joints - 1)
         return self.falsifier.search(tensors, rounds, enough=ENOUGH, linger=LINGER * rounds)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:

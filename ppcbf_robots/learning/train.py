@@ -159,7 +159,7 @@ class Trainer:
             except KeyboardInterrupt:
                 found, interrupted = [], True
             if round_ < 0:  # where the LB-CBF is not clean, its search was cut short
-                tested = [t for t in found if t.clean]
+                tested = [t for t in found if t.clean and self._has_reserve(t)]
             else:
                 tested += found
             tested = sorted(tested, key=lambda t: t.order)
@@ -179,6 +179,14 @@ class Trainer:
                 on_refine(f"{wrong}: refining{', for a larger set than the one that stands' if enough else ''}")
         best = tested[0] if tested else Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
         return self._result(best, interrupted)
+
+    def _has_reserve(self, tested: Tested) -> bool:
+        """Whether the least reserve seen is what training asks for, where states are too many to be covered.
+
+        The LB-CBF of an arm stood a short search by luck, and a longer one found what violates.
+        """
+        covered = self.problem.model.nv <= self.preset.covered_joints
+        return covered or tested.attack is None or tested.attack.worst >= self.descent.margin
 
     def _descend(self, on_check: Callable[[Monitor], None] | None, time_limit: float) -> None:
         """Lines 2 to 12 of Algorithm 1."""
