@@ -41,11 +41,11 @@ from ppcbf_robots.learning.train import (
     MIN_SAMPLES,
     Monitor,
     Result,
-    Tested,
     Trainer,
     settings,
     with_gamma,
 )
+from ppcbf_robots.learning.train import Tested as Judged  # pytest would take it for a test
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -435,24 +435,40 @@ def test_what_slows_all_motions_grows_with_every_demand_and_is_held(panda):
 
 
 def test_the_share_of_the_energy_is_not_trained_unless_training_begins_inside(panda, monkeypatch):
-    def trained() -> float:
+    """From inside the set has further to grow, so it is given twice the iterations."""
+
+    def trained() -> tuple[float, int]:
         descent = margin_descent(panda)
         for _ in range(2):
             descent.iterate()
-        return float(np.log1p(np.exp(descent.params[HELD].double().item())))
+        return float(np.log1p(np.exp(descent.params[HELD].double().item()))), descent.planned
 
-    assert trained() == pytest.approx(MANY_JOINTS[HELD], rel=1e-5)
+    assert trained() == (pytest.approx(MANY_JOINTS[HELD], rel=1e-5), TINY.iterations)
     monkeypatch.setattr(MarginDescent, "_violated_without_term", lambda self: 1.0)
-    assert trained() != pytest.approx(INSIDE[HELD], rel=1e-5)
+    share, planned = trained()
+    assert share != pytest.approx(INSIDE[HELD], rel=1e-5) and planned == 2 * TINY.iterations
 
 
-def test_the_lb_barrier_of_an_arm_stands_only_with_the_reserve_that_training_asks_for(panda, two_link):
+def test_an_arm_stands_only_with_reserve_and_its_lb_barrier_with_all_that_training_asks_for(panda, two_link):
     check, none = BandCheck(10, 0, 10), np.zeros((0, 7))
-    for problem, enough in ((panda, False), (two_link, True)):
+    for problem, covered in ((panda, False), (two_link, True)):
         trainer = Trainer(problem, "pp-ncbf", TINY)
-        margin = trainer.descent.margin
-        for worst, stands in ((1.1 * margin, True), (0.5 * margin, enough)):
-            assert trainer._has_reserve(Tested({}, check, Attack(worst, none, none, 10), 1.0)) is stands
+        left = [Judged({}, check, Attack(x * trainer.descent.margin, none, none, 10), 1.0) for x in (1.1, 0.5, 0.1)]
+        assert [trainer._has_reserve(t, 1.0) for t in left] == [True, covered, covered]
+        assert [trainer._has_reserve(t) for t in left] == [True, True, covered]
+
+
+def test_a_set_with_little_reserve_is_refined_and_counts_where_nothing_better_is_found(panda, monkeypatch):
+    monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: BandCheck(300, 0, 300))
+    reserves, none = iter([0.001, -0.2]), np.zeros((0, 7))
+    monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: Attack(next(reserves), none, none, 10))
+    monkeypatch.setattr(
+        Trainer, "_descend", lambda self, *given: setattr(self, "clean", [(0.9, self.descent.snapshot())])
+    )
+    notes: list[str] = []
+    _, result = train(panda, dataclasses.replace(TINY, refinements=1), on_refine=notes.append)
+    assert notes == ["the falsifier found states of a reserve of 0.0010 only: refining"]
+    assert result.converged and result.attack.worst == 0.001
 
 
 def test_a_set_without_a_band_is_told_and_does_not_crash(cartpole, monkeypatch):
@@ -549,7 +565,7 @@ def test_states_known_to_violate_make_a_search_needless(panda, monkeypatch):
 def test_the_rate_warms_up_for_a_refinement(two_link):
     descent = margin_descent(two_link)
     p = dataclasses.replace(DEFAULT, iterations=100, refinement_share=0.5, refinement_rate=0.4)
-    descent.preset, descent.planned = p, 100
+    descent.preset, descent.planned, descent.first_round = p, 100, 100
 
     def rate(iteration: int, planned: int) -> float:
         descent.iteration, descent.planned = iteration, planned

@@ -55,6 +55,7 @@ class Descent(ABC):
         self.epsilon = self.band.epsilon
         self.margin = preset.margin
         self.iteration, self.planned = 0, preset.iterations
+        self.first_round = self.planned  # iterations before any refinement
         self.evaluated = 0  # band states whose critics were computed in iterations
         self.loss: float | torch.Tensor = float("nan")  # of the last step
 
@@ -110,8 +111,8 @@ class Descent(ABC):
     def set_rate(self) -> None:
         """The learning rate falls linearly over the planned iterations, and from a lower one over a refinement's."""
         p, left = self.preset, self.planned - self.iteration
-        first = self.planned == p.iterations
-        share = left / p.iterations if first else p.refinement_rate * left / (p.refinement_share * p.iterations)
+        first = self.planned == self.first_round
+        share = left / self.first_round if first else p.refinement_rate * left / (p.refinement_share * p.iterations)
         for group in self.optimizer.param_groups:
             group["lr"] = p.learning_rate * max(LAST_RATE, share)
 

@@ -44,6 +44,7 @@ ENOUGH = 100  # violating states that end the evidence's search
 LINGER = 0.15  # of its rounds, that it goes on after the first of them
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
+GROWING = 2  # times the iterations for that: with half as many, a cart-pole at 8 N keeps 7 % less of the LB set
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
@@ -76,8 +77,9 @@ class MarginDescent(Descent):
 
     @torch.no_grad()
     def _begin_inside(self) -> None:
-        """A K so large that the set begins well inside the largest one; all of it is trained."""
+        """A K so large that the set begins well inside the largest one; all of it is trained, and for longer."""
         self._held = []
+        self.planned = self.first_round = GROWING * self.planned
         for name, a in INSIDE.items():
             if name in self.params:
                 self.params[name].fill_(before_softplus(a))

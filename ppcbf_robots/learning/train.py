@@ -23,6 +23,7 @@ from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
 MIN_SAMPLES = 200  # uniform band states below which nothing is claimed
+RESERVE_SHARE = 0.2  # of the reserve that training asks for, left of an arm's set by the evidence's search
 GAIN_ROUNDS = 1  # refinements that a larger set is worth, where a smaller one stands
 CANDIDATES = 3  # clean parameter sets tried by the evidence
 APART = 5e-3  # of the LB set's volume, by which they differ at least: what is wrong with one is so with its like
@@ -159,12 +160,12 @@ class Trainer:
             except KeyboardInterrupt:
                 found, interrupted = [], True
             if round_ < 0:  # where the LB-CBF is not clean, its search was cut short
-                tested = [t for t in found if t.clean and self._has_reserve(t)]
+                tested = [t for t in found if t.clean and self._has_reserve(t, 1.0)]
             else:
                 tested += found
-            tested = sorted(tested, key=lambda t: t.order)
+            tested = sorted(tested, key=lambda t: (not t.clean, not self._has_reserve(t), *t.order))
             out_of_time = time.monotonic() - self.started > time_limit
-            enough = bool(tested) and tested[0].clean
+            enough = bool(tested) and tested[0].clean and self._has_reserve(tested[0])
             gained += enough
             larger = enough and any(t.volume_kept > tested[0].volume_kept for t in found)  # that did not stand
             last = round_ == self.preset.refinements or (enough and not (larger and gained <= GAIN_ROUNDS))
@@ -175,18 +176,19 @@ class Trainer:
                 continue
             self._refine(found, demanding=not enough)
             if on_refine is not None:
-                wrong = _said(found[0]) if found else "no clean barrier"
+                wrong = _said(found[0]) if found else "no clean barrier was found"
                 on_refine(f"{wrong}: refining{', for a larger set than the one that stands' if enough else ''}")
         best = tested[0] if tested else Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
         return self._result(best, interrupted)
 
-    def _has_reserve(self, tested: Tested) -> bool:
-        """Whether the least reserve seen is what training asks for, where states are too many to be covered.
+    def _has_reserve(self, tested: Tested, share: float = RESERVE_SHARE) -> bool:
+        """Whether the least reserve seen is that share of what training asks for, where states cannot be covered.
 
-        The LB-CBF of an arm stood a short search by luck, and a longer one found what violates.
+        What an arm's set has left of a short search by luck, a longer one takes: the LB-CBF, of which nothing was
+        trained, has to have all that training asks for.
         """
         covered = self.problem.model.nv <= self.preset.covered_joints
-        return covered or tested.attack is None or tested.attack.worst >= self.descent.margin
+        return covered or tested.attack is None or tested.attack.worst >= share * self.descent.margin
 
     def _descend(self, on_check: Callable[[Monitor], None] | None, time_limit: float) -> None:
         """Lines 2 to 12 of Algorithm 1."""
@@ -295,10 +297,12 @@ class Trainer:
 
 
 def _said(tested: Tested) -> str:
-    """What the evidence found wrong, in words."""
+    """What the evidence found wrong, or little of, in words."""
     check, attack = tested.check, tested.attack
     if check.violations or attack is None:
         return f"{check.violations} of {check.samples} uniform band states violate the limits"
+    if attack.worst >= 0.0:
+        return f"the falsifier found states of a reserve of {attack.worst:.4f} only"
     return f"the falsifier found violating states, of a reserve of {attack.worst:.4f} at least"
 
 
