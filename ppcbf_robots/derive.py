@@ -11,8 +11,8 @@ from ppcbf_robots.specs import Array, ControllerSpec, DomainSpec, per_joint
 
 SAMPLES = 1000  # configurations over which gravity and inertia are bounded; with 200 rare light postures are missed
 SAMPLE_SEED = 0
-DAMPING_SHARE = 0.3  # of the torque left beside gravity, taken by damping at the fastest velocity of X
-SPRING_SHARE = 0.1  # of what then is left, taken by the spring; with all of it hardly a torque is passive that brakes
+DAMPING_SHARE = 0.2  # of the torque left beside gravity, taken by damping at the fastest velocity of X
+SPRING_SHARE = 0.09  # of what then is left, taken by the spring; with all of it hardly a torque is passive that brakes
 DAMPING_RATE = 20.0  # [1/s], of the mean joint inertia, at most: light joints need no more
 SPRING_TIME = 0.15  # [s], in which the spring alone may bring the mean joint inertia to full speed, at least
 SPRING_RATE = 4.0  # [1/s], K_p / K_d: the rate at which a heavily damped joint closes its error
@@ -71,7 +71,7 @@ def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
 def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain) -> Gains:
     """Given gains, else a well damped bounded spring that fits beside gravity in the torque box.
 
-    Damping at the fastest velocity of X takes 0.3 of the torque beside gravity, less where ``λ_max(M⁻¹ K_d) dt`` would
+    Damping at the fastest velocity of X takes 0.2 of the torque beside gravity, less where ``λ_max(M⁻¹ K_d) dt`` would
     exceed 0.7 over sampled configurations, and no more than ``20/s`` of the mean joint inertia. The spring is as stiff
     as a damping ratio of 0.5 on that inertia allows. Its bound leaves room for gravity, damping and the filter, and
     suits the inertia too: whatever takes over from a stretching spring must, to be passive, take out the power that
