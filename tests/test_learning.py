@@ -454,8 +454,8 @@ def test_an_arm_stands_only_with_reserve_and_its_lb_barrier_with_all_that_traini
     for problem, covered in ((panda, False), (two_link, True)):
         trainer = Trainer(problem, "pp-ncbf", TINY)
         left = [Judged({}, check, Attack(x * trainer.descent.margin, none, none, 10), 1.0) for x in (1.1, 0.5, 0.1)]
-        assert [trainer._has_reserve(t, 1.0) for t in left] == [True, covered, covered]
-        assert [trainer._has_reserve(t) for t in left] == [True, True, covered]
+        assert [trainer._stands(t, 1.0) for t in left] == [True, covered, covered]
+        assert [trainer._stands(t) for t in left] == [True, True, covered]
 
 
 def test_a_set_with_little_reserve_is_refined_and_counts_where_nothing_better_is_found(panda, monkeypatch):

@@ -44,7 +44,7 @@ ENOUGH = 100  # violating states that end the evidence's search
 LINGER = 0.15  # of its rounds, that it goes on after the first of them
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
-GROWING = 2  # times the iterations for that: with half as many, a cart-pole at 8 N keeps 7 % less of the LB set
+GROWING = 2  # times the iterations for that: with half as many, sets end where they could have grown on
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
@@ -56,7 +56,7 @@ class MarginDescent(Descent):
         self.falsifier = Falsifier(problem, self.band, self.rays.h.shape[1], self.rng)
         self._joints = problem.model.nv
         self.margin = max(MIN_MARGIN, preset.margin * (self._joints - 1))
-        self._held = [name for name in self.params if name == HELD]  # parameters that are not, or no longer, trained
+        self._held = [HELD] if HELD in self.params else []  # parameters that are not, or no longer, trained
         self._hunt = self.falsifier.start(HUNTING)  # goes on from check to check
         self._first_pool = len(self.rays)
         if self._violated_without_term() > MANY:

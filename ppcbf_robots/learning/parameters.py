@@ -14,7 +14,7 @@ from ppcbf_robots.specs import Array
 Tensors = dict[str, torch.Tensor]
 # Training begins next to the LB-CBF, whose set is the largest, and K grows where margins ask for it. First a [m/s] of
 # the terms that slow all motions, for robots whose X is covered by samples, and for those where more is unseen. There
-# the share of the kinetic energy is as large as leaves hardly a state of a Panda or a UR5 without a torque by itself:
+# the share of the kinetic energy is as large as leaves hardly a state without a torque by itself (README, Training):
 FEW_JOINTS = {"cone_a": 0.005, "bowl_a": 0.002}
 MANY_JOINTS = {"cone_a": 0.005, "bowl_a": 0.005, "energy_a": 0.12}
 HELD = "energy_a"  # not trained: training would give back what states yet unseen need

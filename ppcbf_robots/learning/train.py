@@ -160,12 +160,12 @@ class Trainer:
             except KeyboardInterrupt:
                 found, interrupted = [], True
             if round_ < 0:  # where the LB-CBF is not clean, its search was cut short
-                tested = [t for t in found if t.clean and self._has_reserve(t, 1.0)]
+                tested = [t for t in found if self._stands(t, 1.0)]
             else:
                 tested += found
-            tested = sorted(tested, key=lambda t: (not t.clean, not self._has_reserve(t), *t.order))
+            tested = sorted(tested, key=lambda t: (not self._stands(t), *t.order))
             out_of_time = time.monotonic() - self.started > time_limit
-            enough = bool(tested) and tested[0].clean and self._has_reserve(tested[0])
+            enough = bool(tested) and self._stands(tested[0])
             gained += enough
             larger = enough and any(t.volume_kept > tested[0].volume_kept for t in found)  # that did not stand
             last = round_ == self.preset.refinements or (enough and not (larger and gained <= GAIN_ROUNDS))
@@ -181,14 +181,15 @@ class Trainer:
         best = tested[0] if tested else Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
         return self._result(best, interrupted)
 
-    def _has_reserve(self, tested: Tested, share: float = RESERVE_SHARE) -> bool:
-        """Whether the least reserve seen is that share of what training asks for, where states cannot be covered.
+    def _stands(self, tested: Tested, share: float = RESERVE_SHARE) -> bool:
+        """Whether it is clean and, where states cannot be covered, keeps that share of the reserve training asks for.
 
         What an arm's set has left of a short search by luck, a longer one takes: the LB-CBF, of which nothing was
         trained, has to have all that training asks for.
         """
         covered = self.problem.model.nv <= self.preset.covered_joints
-        return covered or tested.attack is None or tested.attack.worst >= share * self.descent.margin
+        ample = covered or tested.attack is None or tested.attack.worst >= share * self.descent.margin
+        return tested.clean and ample
 
     def _descend(self, on_check: Callable[[Monitor], None] | None, time_limit: float) -> None:
         """Lines 2 to 12 of Algorithm 1."""
