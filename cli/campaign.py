@@ -24,6 +24,7 @@ from ppcbf_robots.cli.simulate import (
     EngineOption,
     FilterOption,
     MetricOption,
+    certificate_line,
     choose_barrier,
     described,
     limit_rate,
@@ -186,6 +187,7 @@ def _facts(whole: Chunk, records: Sequence[Record]) -> dict[str, Any]:
     problem, barrier, config = whole.load()
     made = {**described(problem, barrier, config), "barrier": whole.barrier, "engine": whole.engine}
     made["effort_rate"] = whole.effort_rate
+    made["certificate"] = certificate_line(problem, whole.barrier, config, None)
     made["barrier_sha256"] = load_barrier(Path(whole.barrier)).digest if Path(whole.barrier).is_dir() else None
     seconds = round(sum(record["result"]["seconds"] for record in records), 1)
     return {**made, **dataclasses.asdict(whole.drawing), **total(outcomes), "seconds": seconds}
@@ -248,6 +250,8 @@ def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
         ["CPU time [s]", f"{facts['seconds']:.1f}"],
     ]  # fmt: skip
     table(title, ["what", "figure"], rows)
+    if facts["certificate"] is not None:
+        out.print(f"certificate: {facts['certificate']}")
     if facts["failed"]:
         shown = ", ".join(map(str, facts["failed"][:10])) + (", ..." if len(facts["failed"]) > 10 else "")
         out.print(f"failed: {shown}; the same command with --replay N --out T.npz writes one of them")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -76,7 +77,7 @@ def simulate(
     trajectory = run(problem, chosen, config, q, v, duration, {"barrier": barrier}, engine)
     trajectory.save(out_file)
     facts = trajectory.summary(model) | {"outside_domain": outside_domain(problem, trajectory), "out": str(out_file)}
-    said = certificate_line(problem, barrier, config)
+    said = certificate_line(problem, barrier, config, problem.model.to_angles(problem.robot.goal).tolist())
     facts |= {"certificate": said}
     emit_json(facts) if json else _print(facts, trajectory, problem)
     if chosen is not None and facts["outside_domain"] > 0.0:
@@ -104,17 +105,20 @@ def outside_domain(problem: Problem, trajectory: Trajectory) -> float:
     return float(np.mean((out_q | out_v).any(axis=1)))
 
 
-def certificate_line(problem: Problem, name: str, config: FilterConfig) -> str | None:
-    """What the certificate of a barrier folder says, and about what else if not this; None for other barriers."""
+def certificate_line(problem: Problem, name: str, config: FilterConfig, goal: Sequence[float] | None) -> str | None:
+    """What the certificate of a barrier folder says, and about what else if not this; None for other barriers.
+
+    ``goal`` has one number per joint; None stands for many goals.
+    """
     if not Path(name).is_dir():
         return None
     certificate = load_barrier(Path(name)).certificate
     if certificate is None:
         return "none; ppcbf verify makes one"
-    goal = problem.model.to_angles(problem.robot.goal)
     limited = bool(np.isfinite(problem.model.u_rate).any())
     gap = certificate.gap(goal, config.kind, config.metric, config.alpha, config.margin, config.dt, limited)
-    return certificate.line() + (f"; {gap}, not for this run" if gap else "")
+    subject = "these runs" if goal is None else "this run"
+    return certificate.line() + (f"; {gap}, not for {subject}" if gap else "")
 
 
 def choose_barrier(

@@ -66,10 +66,13 @@ class Certificate:
         return f"{self.verdict} ({parts}{f'; masses within {masses:.3g} of the model' if masses else ''})"
 
     def gap(
-        self, goal: Sequence[float], filter_kind: str, metric: str, alpha: float, margin: float, dt: float,
+        self, goal: Sequence[float] | None, filter_kind: str, metric: str, alpha: float, margin: float, dt: float,
         rate_limited: bool,
     ) -> str:  # fmt: skip
-        """Why it does not speak about a filter and a goal (one number per joint), as a clause; "" if it does."""
+        """Why it does not speak about a filter and a goal (one number per joint), as a clause; "" if it does.
+
+        Without a goal it is asked about many.
+        """
         known = self.subject["filter"]
         if (filter_kind, metric, alpha) != (known["kind"], known["metric"], known["alpha"]):
             return f"for the {known['kind']} filter in the {known['metric']} metric with alpha = {known['alpha']:g}"
@@ -77,6 +80,8 @@ class Certificate:
             return f"for a control period of {self.subject['dt']:g} s and a margin of {self.subject['margin']:g}"
         if rate_limited:
             return "for torques whose rate is not limited"
+        if goal is None:
+            return "passivity for one goal alone"
         if any(abs(a - b) > GOAL_TOLERANCE for a, b in zip(goal, self.subject["goal"], strict=True)):
             return "passivity for another goal"
         return ""

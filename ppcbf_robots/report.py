@@ -29,6 +29,7 @@ class Figures(BaseModel):
     obstacles: str
     barrier: str
     barrier_sha256: str | None
+    certificate: str | None
     barrier_kind: str
     engine: str
     duration: float

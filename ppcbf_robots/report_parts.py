@@ -192,6 +192,8 @@ def _campaign(m: Material) -> Section:
     if not same_barrier(m):
         here = facts["barrier"] == str(m.folder.resolve())
         text.append(f"These runs used another barrier: {'one that was here before' if here else facts['barrier']}.")
+    if facts["certificate"] is not None:
+        text.append(f"Certificate of the barrier then: {facts['certificate']}.")
     rows = [
         ["runs with a contact", str(facts["contacts"])],
         ["runs beyond a torque limit", str(facts["torque_violations"])],
