@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,16 +18,17 @@ from ppcbf_robots.filters import NEAR_REST, Box, Correction, FilterConfig, Statu
 from ppcbf_robots.qp_filter import QPFilter
 from ppcbf_robots.robot import Dynamics, RobotModel
 from ppcbf_robots.safety import SafetyFunction, SafetyRows
+from ppcbf_robots.sent_torques import SentTorques
 from ppcbf_robots.shapes import Motion, Packed
 from ppcbf_robots.slip import SlipBatch, SlipObserver
 from ppcbf_robots.specs import Array
 from ppcbf_robots.state_check import StateCheck, is_finite_number
+from ppcbf_robots.status_log import StatusLog
 
 log = logging.getLogger(__name__)
 
 RESTING_TIME = 0.02  # [s]
 _NOT_FINITE = "u_des, d_p or the barrier is not finite"
-_NUMBERS = dict.fromkeys(map(ord, "0123456789.e+-"))  # left out where two reasons are compared
 
 
 @dataclass(frozen=True)
@@ -93,27 +93,23 @@ class SafetyFilter:
         rate: ArrayLike | None = None,
     ) -> None:
         self.robot, self.safety, self.barrier = robot, safety, barrier
-        self.config = config or FilterConfig()
+        self.config = config = config or FilterConfig()
         self.damping = 0.01 * robot.u_max / robot.v_max if damping is None else np.asarray(damping, float)
         self.gravity_included = gravity_included
-        closed = self.config.kind == "closed-form"
-        limit = self._rate(rate)
+        closed = config.kind == "closed-form"
+        self._sent = SentTorques(robot, config.dt, config.max_age, gravity_included, rate)
         learned = isinstance(barrier, RhoBarrier)
         self._blind: Barrier = RhoBarrier("lb-cbf", robot, barrier.spec) if learned else barrier  # K = 0
         self.correction, self._blind_correction = (
-            ClosedForm(b, self.config) if closed else QPFilter(b, safety, self.config, limit)
+            ClosedForm(b, config) if closed else QPFilter(b, safety, config, self._sent.rate)
             for b in (barrier, self._blind)
         )
-        self.counts: dict[Status, int] = dict.fromkeys(Status, 0)
-        self._logged: tuple[Status, str] = Status.FREE, ""
+        self._log = StatusLog(log)
+        self.counts = self._log.counts
         self._slow = NEAR_REST * robot.v_max
-        config = self.config
         self._check = StateCheck(robot, config.dt, config.max_age, config.max_hold)
         self._last_g: Array | None = None  # gravity torque of the last valid state
         self._invalid_steps = 0  # in a row
-        self._step_limit = limit * config.dt
-        self._rate_limited = bool(np.isfinite(self._step_limit).any())
-        self._sent: deque[Array] = deque(maxlen=math.ceil(config.max_age / config.dt) + 1)  # torques as returned
         watched = not closed and learned and math.isfinite(config.slip_time)
         self._slip = SlipObserver(config.dt, config.slip_time) if watched else None
         self._moved = False  # whether obstacles were elsewhere in the last step
@@ -124,19 +120,10 @@ class SafetyFilter:
         """Forget the last state and torque, for a clock that starts anew or an arm that was moved by other means."""
         self._check.reset()
         self._last_g, self._invalid_steps = None, 0
-        self._logged = Status.FREE, ""
+        self._log.reset()
         self._sent.clear()
         if self._slip is not None:
             self._slip.reset()
-
-    def _rate(self, rate: ArrayLike | None) -> Array:
-        try:
-            rates = np.array(np.broadcast_to(self.robot.u_rate if rate is None else rate, (self.robot.nv,)), float)
-        except (TypeError, ValueError):
-            rates = np.zeros(self.robot.nv)
-        if not np.all(rates > 0.0):
-            raise InputError(f"rate: expected one positive number or {self.robot.nv}, got {rate!r}")
-        return rates
 
     def step(
         self,
@@ -178,9 +165,9 @@ class SafetyFilter:
             self._invalid_steps += 1
             return self._count(self._hold(t, problem))
         self._check.accept(t, q.copy(), v.copy())
-        dyn = self.robot.evaluate(*(self._predict(q, v, age) if age > 0.0 else (q, v)))
+        dyn = self.robot.evaluate(*(self._sent.predict(q, v, age) if age > 0.0 else (q, v)))
         self._last_g, self._invalid_steps = dyn.g, 0
-        allowed = self._allowed(dyn.g)
+        allowed = self._sent.allowed(dyn.g)
         try:
             obstacles = self.safety.packed.moved(motions) if motions else None
         except InputError as error:
@@ -189,42 +176,13 @@ class SafetyFilter:
             return self._count(self._fault(dyn, unknown, allowed=allowed))
         return self._count(self.filter(dyn, u_des, d_p, obstacles, allowed, t))
 
-    def _predict(self, q: Array, v: Array, age: float) -> tuple[Array, Array]:
-        """The state ``age`` [s] later under the torques returned since, before the first of them gravity's."""
-        dt = self.config.dt
-        periods, rest = divmod(age, dt)
-        pieces = [dt] * int(periods) + [rest]
-        q_now, v_now = q, v
-        for i, piece in enumerate(reversed(pieces)):
-            behind = len(pieces) - i  # periods ago
-            u = self._sent[-behind] if behind <= len(self._sent) else None
-            if u is None or not self.gravity_included:
-                u = self.robot.gravity(q_now) + (0.0 if u is None else u)
-            v_now = v_now + piece * self.robot.acceleration(q_now, v_now, u)
-            q_now = self.robot.integrate(q_now, piece * v_now)
-        usable = bool(np.isfinite(q_now).all() and np.isfinite(v_now).all())
-        return (q_now, v_now) if usable else (q, v)
-
     def _tell(self, u_last: ArrayLike) -> str:
         """Take over the caller's last torque; in words why not, if it cannot be used."""
         u = _numbers(u_last)
         if u.shape != (self.robot.nv,) or not np.isfinite(u).all():
             return f"u_last is not {self.robot.nv} finite numbers"
-        if self._sent:
-            self._sent.pop()
-        self._sent.append(u)
+        self._sent.correct(u)
         return ""
-
-    def _allowed(self, g: Array) -> Box | None:
-        """Torques, gravity included, that box and rate allow after the last one; None if the rate is not limited.
-
-        The box comes first where a last torque outside it leaves no other.
-        """
-        if not self._rate_limited:
-            return None
-        u_max, offset = self.robot.u_max, 0.0 if self.gravity_included else g
-        last = self._sent[-1] + offset if self._sent else np.clip(g, -u_max, u_max)
-        return np.clip(last - self._step_limit, -u_max, u_max), np.clip(last + self._step_limit, -u_max, u_max)
 
     def filter(
         self,
@@ -329,12 +287,12 @@ class SafetyFilter:
         wary = rows if slips is None else slips.wary(t, rows)
         total = u_des if self.gravity_included else u_des + dyn.g
         free, short = self.correction.passes(dyn, wary, total, self.robot.u_max)
-        return Screen(free & (not self._rate_limited), short, safety, rows, wary)
+        return Screen(free & (not self._sent.rate_limited), short, safety, rows, wary)
 
     def step_screened(self, dyn: Dynamics, screen: Screen, i: int, u_des: Array, d_p: float | None) -> StepResult:
         """The step for a valid state ``dyn``, number i of a screened batch, after the last one that this filter saw."""
         safety, rows, wary = screen.at(i)
-        allowed = self._allowed(dyn.g)
+        allowed = self._sent.allowed(dyn.g)
         usable, h, phi = self._survey(rows, u_des, d_p)
         if not usable:
             return self._count(self._fault(dyn, _NOT_FINITE, h, phi, allowed=allowed))
@@ -374,20 +332,13 @@ class SafetyFilter:
             held = max(held, t - self._check.last[0])
         g, u_max = self._last_g, self.robot.u_max
         if g is not None and held <= self.config.max_hold:
-            u = np.clip(g, *(self._allowed(g) or (-u_max, u_max)))
+            u = np.clip(g, *(self._sent.allowed(g) or (-u_max, u_max)))
             return StepResult(u if self.gravity_included else u - g, Status.INVALID, problem, np.nan, np.nan, "")
         return StepResult(np.zeros(self.robot.nv), Status.STOP, f"{problem}: engage the brakes", np.nan, np.nan, "")
 
     def _count(self, result: StepResult) -> StepResult:
-        self.counts[result.status] += 1
+        self._log.note(result.status, result.reason, result.row)
         self._sent.append(result.u)
-        alarm = result.status >= Status.PASSIVITY_DROPPED
-        if alarm or result.status is not self._logged[0]:
-            said = result.status, result.reason.translate(_NUMBERS) if alarm else ""
-            if said != self._logged:  # a change, not every tick of a lasting alarm
-                level = logging.WARNING if alarm else logging.DEBUG
-                log.log(level, "%s: %s %s", result.status.name, result.reason, result.row)
-                self._logged = said
         return result
 
 

@@ -27,7 +27,7 @@ LAYERS = [
     ["condense", "ending"],
     ["barriers", "derive", "derive_body", "qp", "self_collision"],
     ["cutting_planes", "filters", "state_check", "slip"],
-    ["closed_form", "qp_filter"],
+    ["closed_form", "qp_filter", "sent_torques", "status_log"],
     ["safety_filter", "problem"],
     ["rollout", "artefact", "evidence", "engine_mujoco", "viable_set", "symbolic"],
     ["lockstep"],
