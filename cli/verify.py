@@ -97,7 +97,7 @@ def verify(
     else:
         found = _prove(problem, stored, folder, power, mass_error / 100.0, jobs, time_limit)
     judged, states, details = found
-    # also by earlier runs that a proof went on from
+    # also by earlier runs that this one went on from
     seconds_spent = max(time.monotonic() - began, details.pop("seconds", 0.0))
     certificate = Certificate(
         overall(judged), judged, _subject(stored), _not_covered(mass_error), round(seconds_spent, 2),
@@ -184,6 +184,7 @@ def _sample(
     if failed:
         raise CheckFailed(f"{len(failed)} of {len(tasks)} tasks ended with an error; the first: {failed[0]}")
     found, states, details = conditions(stored, records, confidence)
+    details["seconds"] /= jobs
     if not attacks:
         details["no_attack"] = "the attack knows the QP filter alone" if seconds > 0.0 else "--seconds 0"
     (folder / RECORDS).unlink()

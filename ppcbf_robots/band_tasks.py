@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -70,12 +71,13 @@ def attack_tasks(job: BandJob, count: int, seconds: float) -> list[Task]:
 
 
 def _sample(job: BandJob, chunk: int, count: int) -> dict[str, Any]:
+    began = time.monotonic()
     problem, stored = job.load()
     barrier = stored.barrier(problem)
     q, v, tried = independent_band(problem, barrier, count, job.rng(0, chunk))
     counts = count_violations(problem, barrier, stored.filter_config(), stored.kind == "pp-ncbf", q, v)
     counts.tried = tried
-    return asdict(counts)
+    return {**asdict(counts), "seconds": time.monotonic() - began}
 
 
 def _attack(job: BandJob, index: int, seconds: float) -> dict[str, Any]:
@@ -84,23 +86,29 @@ def _attack(job: BandJob, index: int, seconds: float) -> dict[str, Any]:
 
     from ppcbf_robots.learning.falsifier import falsify
 
+    began = time.monotonic()
     torch.set_num_threads(1)
     problem, stored = job.load()
     barrier, config = stored.barrier(problem), stored.filter_config()
     found = falsify(problem, barrier, config, job.rng(1, index), seconds)
     counts = count_violations(problem, barrier, config, stored.kind == "pp-ncbf", found.q[:KEPT], found.v[:KEPT])
     worst = float(found.worst) if math.isfinite(found.worst) else None
-    return {**asdict(counts), "samples": 0, "worst_margin": worst, "evaluated": found.evaluated}
+    searched = {"samples": 0, "worst_margin": worst, "evaluated": found.evaluated}
+    return {**asdict(counts), **searched, "seconds": time.monotonic() - began}
 
 
 def conditions(
     stored: StoredBarrier, records: list[Record], confidence: float
 ) -> tuple[dict[str, Condition], dict[str, list[list[float]]], dict[str, Any]]:
-    """Conditions, states that break them, and further figures, from the records of all tasks."""
+    """Conditions, states that break them, and further figures, from the records of all tasks.
+
+    ``seconds`` among the figures are those of all tasks together.
+    """
     drawn, attacked = BandCounts(), BandCounts()
-    margins, evaluated = [], 0
+    margins, evaluated, seconds = [], 0, 0.0
     for record in records:
         result = dict(record["result"])
+        seconds += result.pop("seconds")
         is_attack = "evaluated" in result
         if is_attack:
             margin, evaluated = result.pop("worst_margin"), evaluated + result.pop("evaluated")
@@ -128,4 +136,5 @@ def conditions(
         found[name] = Condition(verdict, said, p, confidence, drawn.samples, drawn.violations[name], margin)
         states[name] = drawn.states[name] + attacked.states[name]
     band = drawn.samples / drawn.tried if drawn.tried else 0.0
-    return found, states, {"band_volume": band, "states_of_X": drawn.tried, "attacked": evaluated}
+    details = {"band_volume": band, "states_of_X": drawn.tried, "attacked": evaluated, "seconds": seconds}
+    return found, states, details

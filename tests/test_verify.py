@@ -190,14 +190,18 @@ def test_samples_of_a_barrier_that_was_there_before_do_not_count(folder, tmp_pat
     monkeypatch.setattr("ppcbf_robots.cli.verify.conditions", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
     assert run_cli("verify", path, *short).code == 130
     monkeypatch.undo()
-    half_done = (path / "verify.jsonl").read_text()
+    record = json.loads((path / "verify.jsonl").read_text())
+    record["result"]["seconds"] = 1000.0
+    half_done = json.dumps(record) + "\n"
+    (path / "verify.jsonl").write_text(half_done)
     problem = load_problem("two_link", "circle")
     drawn = []
     monkeypatch.setattr(
         "ppcbf_robots.cli.verify.conditions",
         lambda stored, records, c: drawn.append(records) or conditions(stored, records, c),
     )
-    facts("verify", path, *short)  # goes on: nothing is drawn again
+    resumed = facts("verify", path, *short)  # goes on: nothing is drawn again, and its time counts
+    assert resumed["seconds"] >= 1000.0
     save_barrier(path, problem.with_barrier_spec(BarrierSpec(gamma=3.0)), "pp-ncbf", "convex", no_network(problem),
                  FilterConfig(), {})  # fmt: skip
     (path / "verify.jsonl").write_text(half_done)
