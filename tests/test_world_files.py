@@ -453,7 +453,7 @@ def test_meshes_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert said("gone.stl") == f"mesh file not found: gone.stl (tried {tmp_path / 'gone.stl'})"
     assert said("a" * 5000 + ".stl").endswith("cannot be read (File name too long)")
     (tmp_path / "t.glb").write_text("x")
-    assert said("t.glb") == "mesh 't.glb': meshes are read from .stl, .obj, .dae files"
+    assert said("t.glb") == "mesh 't.glb' has an unknown format; convert it to stl, dae, obj"
     (tmp_path / "bad.stl").write_text("garbage")
     assert said("bad.stl") == "mesh 'bad.stl' cannot be read (File is too small)"
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1e-9\nf 1 2 3\nf 2 3 4\n")

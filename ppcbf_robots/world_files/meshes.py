@@ -14,7 +14,6 @@ from ppcbf_robots.resources import default_package_dirs
 from ppcbf_robots.specs import Array
 from ppcbf_robots.world_shapes import convex
 
-MESH_SUFFIXES = (".stl", ".obj", ".dae")
 MAX_POINTS = 500_000  # of a mesh as given
 MAX_HULL = 2_000  # vertices of a hull; distances to more would not keep up with a control loop
 
@@ -32,8 +31,6 @@ def mesh_hull(resource: str, scale: Sequence[float], world: Path, where: str) ->
         InputError: if the mesh is missing, unreadable, flat, or has too many vertices.
     """
     path = _find(resource, world, where)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{where}: mesh '{resource}': meshes are read from {', '.join(MESH_SUFFIXES)} files")
     if problem := mesh_problem(path):
         raise InputError(f"{where}: mesh '{resource}' {problem}")
     try:
