@@ -59,6 +59,11 @@ class Descent(ABC):
         self.evaluated = 0  # band states whose critics were computed in iterations
         self.loss: float | torch.Tensor = float("nan")  # of the last step
 
+    @property
+    def refined(self) -> bool:
+        """Whether the evidence has asked for more than the first round."""
+        return self.planned > self.first_round
+
     @abstractmethod
     def iterate(self) -> None:
         """One iteration: states on the band, a gradient step, the weights' update."""
@@ -111,10 +116,9 @@ class Descent(ABC):
     def set_rate(self) -> None:
         """The learning rate falls linearly over the planned iterations, and from a lower one over a refinement's."""
         p, left = self.preset, self.planned - self.iteration
-        first = self.planned == self.first_round
-        share = left / self.first_round if first else p.refinement_rate * left / (p.refinement_share * p.iterations)
+        first, later = left / self.first_round, p.refinement_rate * left / (p.refinement_share * p.iterations)
         for group in self.optimizer.param_groups:
-            group["lr"] = p.learning_rate * max(LAST_RATE, share)
+            group["lr"] = p.learning_rate * max(LAST_RATE, later if self.refined else first)
 
     def sample(
         self, count: int, pool: torch.Tensor | None = None, params: Tensors | None = None, rising: bool = False

@@ -45,7 +45,7 @@ LINGER = 0.15  # of its rounds, that it goes on after the first of them
 LOOKED_AT = 4_000  # rays, for the share that the LB-CBF violates
 MANY = 0.2  # of it, from where on training begins with a large K: growing it from outside ends with smaller sets
 GROWING = 2  # times the iterations for that: with half as many, sets end where they could have grown on
-THOROUGH = 3  # times the evidence's search: sets that were cut back so far violate in small pockets if at all
+THOROUGH = 3  # times the evidence's search of a set that was refined: what still violates are small pockets
 HUMBLER = 0.7  # factor on the largest weight of the volume per refinement
 
 
@@ -60,8 +60,7 @@ class MarginDescent(Descent):
         self._held = [HELD] if HELD in self.params else []  # parameters that are not, or no longer, trained
         self._hunt = self.falsifier.start(HUNTING)  # goes on from check to check
         self._first_pool = len(self.rays)
-        self._inside = self._violated_without_term() > MANY
-        if self._inside:
+        if self._violated_without_term() > MANY:
             self._begin_inside()
         self._max_weight, self._simplicity = preset.volume_weight / self._joints, preset.simplicity
         self._weight: torch.Tensor = torch.tensor(self._max_weight, device=self.device)
@@ -223,8 +222,8 @@ class MarginDescent(Descent):
             least = self.band.least_reserve(tensors, self.rays_through(known.q, known.v)).cpu().numpy()
             if least.min() < 0.0:
                 return Attack(float(least.min()), known.q[least < 0.0], known.v[least < 0.0], len(least))
-        rounds = self.preset.attack_rounds * max(1, self._joints - 1) * (THOROUGH if self._inside else 1)
-        return self.falsifier.search(tensors, rounds, enough=ENOUGH, linger=LINGER * rounds)
+        rounds, times = self.preset.attack_rounds * max(1, self._joints - 1), THOROUGH if self.refined else 1
+        return self.falsifier.search(tensors, times * rounds, enough=ENOUGH, linger=LINGER * rounds)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
         """Their rays join; they are looked at before the next iteration."""
