@@ -67,6 +67,11 @@ class ClosedForm:
             return Correction(u_des, Status.INFEASIBLE, "L_g phi is zero: no torque changes phi", k)
         return Correction(u_des - psi / gain * direction, Status.CORRECTING, "psi(u_des) < 0", k)
 
+    def violated(self, rows: BarrierRows, u: Array, limited: bool) -> NDArray[np.bool_]:
+        """(rows,): whether a torque u (nv,) breaks the condition on the rows that are looked at."""
+        gamma = self.barrier.spec.gamma_K if self.barrier.kind == "pp-cbf" else 0.0
+        return np.asarray(self._active(rows) & (rows.psi(u) < -gamma * rows.phi))
+
     def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[NDArray[np.bool_], Array]:
         """As :meth:`ppcbf_robots.qp_filter.QPFilter.passes`; nothing is known before each state is looked at."""
         return np.zeros(len(u_des), dtype=np.bool_), np.zeros(len(u_des))

@@ -28,6 +28,7 @@ _FLAT = 1e-9  # length of a row, in units of phi̇ per full torque, below which 
 ROW_TOLERANCE = 1e-6  # of the dimensionless rows, when a solver's claim is checked
 TIGHT = 1e-4  # residual of a dimensionless row below which the correction rests on it
 LOOSE = 1e-3  # by which a solver's answer may be outside its bounds
+ROUNDS = 4  # in which rows that an answer misses join those handed to the solver
 CUTS = 8  # times that a torque is asked for again because of what K does over the period; three light joints took six
 SHORT = 0.4  # of alpha margin, by which a row may fall short over the period: phi still settles above 0. Far from
 # there it may fall twice as fast as alpha says
@@ -110,6 +111,12 @@ class QPFilter:
             return min(self.barrier.spec.gamma_K, fastest), 0.0, min(fast, fastest), 0.0
         alpha = min(self.config.alpha, fastest)
         return alpha, min(fast, fastest - alpha), min(fast, fastest), self.config.margin
+
+    def violated(self, rows: BarrierRows, u: Array, limited: bool) -> NDArray[np.bool_]:
+        """(rows,): whether a torque u (nv,) breaks the barrier's rows; ``limited`` if its rate is."""
+        alpha, release, _, margin = self._gains[limited]
+        class_k = alpha * (rows.phi - margin) + release * np.maximum(0.0, np.minimum(rows.hdot, rows.phi))
+        return np.asarray(rows.psi(u) < -class_k)
 
     def passes(self, dyn: Dynamics, rows: BarrierRows, u_des: Array, u_max: Array) -> tuple[NDArray[np.bool_], Array]:
         """For a batch of states and no limited rate: whether :meth:`correct` leaves u_des (B, nv) as it is, (B,).
@@ -246,7 +253,7 @@ class QPFilter:
         one_more = passivity or (zero, 0.0)
         chosen, rows, bounds = near(qp.C, qp.lower, qp.binding, self.config.near_rows, *one_more, passive)
         missed = np.empty(len(qp.lower), dtype=np.bool_)
-        for _ in range(4):
+        for _ in range(ROUNDS):
             answer = self._ask(QPProblem(qp.H, zero, rows, bounds, *qp.box))
             if answer is None:
                 return None
@@ -265,8 +272,9 @@ class QPFilter:
         """Torque in the box with the least worst violation of the barrier's rows: one slack, heavily weighted."""
         n, box = len(qp.H), qp.box
         steerable = np.flatnonzero(qp.binding[: qp.barrier_rows] & (qp.norm[: qp.barrier_rows] >= _FLAT))
+        best = np.clip(np.zeros(n), *box)
         if not len(steerable):
-            return np.clip(np.zeros(n), *box)
+            return best
         C, lower = qp.C[steerable], qp.lower[steerable]
         reach = np.maximum(C * box[0], C * box[1]).sum(-1)
         lower = np.minimum(lower, reach)  # each row falls short by what is out of its own reach in any case
@@ -274,12 +282,19 @@ class QPFilter:
         H = np.zeros((n + 1, n + 1))
         H[:n, :n] = qp.H
         H[n, n] = LEAST_VIOLATION_WEIGHT
-        rows = np.hstack([C[few], np.ones((len(few), 1))])
+        rows, enough = np.hstack([C, np.ones((len(C), 1))]), lower - LOOSE * np.maximum(1.0, np.abs(lower))
         low, high = np.append(box[0], 0.0), np.append(box[1], 1e6)
-        z = self._ask(QPProblem(H, np.zeros(n + 1), rows, lower[few], low, high))
-        if z is None or np.any(rows @ z < lower[few] - LOOSE * np.maximum(1.0, np.abs(lower[few]))):
-            return None  # the solver claims less of a violation than there is
-        return np.clip(z[:n], *box)
+        for _ in range(ROUNDS):
+            z = self._ask(QPProblem(H, np.zeros(n + 1), rows[few], lower[few], low, high))
+            if z is None:
+                return None
+            best, missed = np.clip(z[:n], *box), rows @ z < enough
+            if missed[few].any():
+                return None  # the solver claims less of a violation than there is
+            if not missed.any():
+                break
+            few = np.union1d(few, np.flatnonzero(missed))
+        return best
 
     def _ask(self, problem: QPProblem) -> Array | None:
         """The solver's answer if it is one: of the right length and in the box. Whatever a solver raises is none."""

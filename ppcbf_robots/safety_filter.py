@@ -139,7 +139,7 @@ class SafetyFilter:
         """One control step.
 
         Args:
-            t: time of the state [s]; must not go backwards.
+            t: time of this step [s], also where the state is older; must not go backwards.
             q: configuration (nq,), continuous joints as (cos, sin).
             v: joint velocity (nv,) [rad/s | m/s].
             u_des: desired torque (nv,) [N m | N].
@@ -209,17 +209,23 @@ class SafetyFilter:
             return self._answer(dyn, safety, rows, rows, h, phi, u_des, d_p, obstacles is not None, allowed)
         wary = self._slip.wary(t, rows)
         result = self._answer(dyn, safety, rows, wary, h, phi, u_des, d_p, obstacles is not None, allowed)
-        if result.status is not Status.FAULT and math.isfinite(result.short):
+        if not math.isfinite(result.short):
+            self._forget_step()
+        elif result.status is not Status.FAULT:
             self._slip.applied(t, rows, result.u if self.gravity_included else result.u + dyn.g, result.short)
         return result
 
     def _change_barrier(self, moved: bool) -> None:
         """From the trained barrier to the LB-CBF where obstacles are elsewhere, and back."""
         self._moved = moved
-        if self._slip is not None:
-            self._slip.forget_step()
+        self._forget_step()
         if getattr(self.barrier, "network", None) is not None:
             log.warning("obstacles %s", "are elsewhere: K = 0 until they are back" if moved else "are back: K is, too")
+
+    def _forget_step(self) -> None:
+        """The next state cannot be compared with what the last step predicted: another torque was sent."""
+        if self._slip is not None:
+            self._slip.forget_step()
 
     def _survey(self, rows: BarrierRows, u_des: Array, d_p: float | None) -> tuple[bool, float, float]:
         """Whether a correction can be sought at all, and the least h and phi."""
@@ -248,27 +254,33 @@ class SafetyFilter:
         where the file has them.
         """
         offset = 0.0 if self.gravity_included else dyn.g
-        pushed = moving and bool(np.any((safety.drift < 0.0) & (rows.psi(u_des + offset) < 0.0)))
-        budget = None if pushed else d_p
-        correction = self._blind_correction if moving else self.correction
-        c = self._correct(correction, dyn, safety, rows, wary, u_des + offset, budget, allowed)
+        correction, total = self._blind_correction if moving else self.correction, u_des + offset
+        broken = correction.violated(rows, total, allowed is not None) if moving else np.zeros(0, dtype=np.bool_)
+        pushed = moving and bool(np.any(broken & (safety.drift < 0.0)))  # by what comes closer
+        content = Status.PASSIVITY_DROPPED if pushed else Status.CORRECTING
+        c = self._correct(correction, dyn, safety, rows, wary, total, d_p, allowed, content)
         if c.status is Status.FAULT:
             return self._fault(dyn, c.reason, h, phi, self._name(c.row), allowed)
-        status = c.status
+        status, reason = c.status, c.reason
+        if pushed and status is Status.PASSIVITY_DROPPED:
+            status, reason = Status.CORRECTING, "passivity yields to an obstacle that comes closer"
         if status is Status.CORRECTING and c.row >= 0 and self._rests(dyn, c.u):
             status = Status.RESTING
         u = c.u - offset
         port = max(0.0, float(dyn.v @ (u - u_des)) - (d_p or 0.0)) if pushed else 0.0
-        return StepResult(u, status, c.reason, h, phi, self._name(c.row), port, c.short)
+        return StepResult(u, status, reason, h, phi, self._name(c.row), port, c.short)
 
     def _correct(
         self, correction: ClosedForm | QPFilter, dyn: Dynamics, safety: SafetyRows, rows: BarrierRows,
-        wary: BarrierRows, u_des: Array, d_p: float | None, allowed: Box | None,
+        wary: BarrierRows, u_des: Array, d_p: float | None, allowed: Box | None, content: Status,
     ) -> Correction:  # fmt: skip
-        """The correction that makes up for the slip of phi, or where that is too much to ask, the one that does not."""
+        """The correction that makes up for the slip of phi, or where that is too much to ask, the one that does not.
+
+        Up to the status ``content`` it is not.
+        """
         u_max = self.robot.u_max
         c = correction.correct(dyn, safety, wary, u_des, d_p, u_max, allowed)
-        if wary is not rows and c.status >= Status.PASSIVITY_DROPPED:
+        if wary is not rows and c.status > content:
             plain = correction.correct(dyn, safety, rows, u_des, d_p, u_max, allowed)
             c = plain if plain.status < c.status else c
         return c
@@ -311,6 +323,7 @@ class SafetyFilter:
 
         With a limited rate it is approached at that rate, and may grow on the way.
         """
+        self._forget_step()
         u = np.clip(dyn.g - self.damping * dyn.v, *(allowed or (-self.robot.u_max, self.robot.u_max)))
         return StepResult(u if self.gravity_included else u - dyn.g, Status.FAULT, reason, h, phi, row)
 
@@ -327,6 +340,7 @@ class SafetyFilter:
         STOP is zero torque at once. Time is the caller's clock or the count of steps, whichever is longer: the clock
         may be what failed.
         """
+        self._forget_step()
         held = self._invalid_steps * self.config.dt
         if self._check.last is not None and is_finite_number(t):
             held = max(held, t - self._check.last[0])

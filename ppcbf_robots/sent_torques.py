@@ -40,13 +40,13 @@ class SentTorques:
 
     def append(self, u: Array) -> None:
         """The torque that is sent now."""
-        self._sent.append(u)
+        self._sent.append(u.copy())  # the caller may write into what it was given
 
     def correct(self, u_last: Array) -> None:
         """The caller knows better what was in force until now."""
         if self._sent:
             self._sent.pop()
-        self._sent.append(u_last)
+        self._sent.append(u_last.copy())
 
     def allowed(self, g: Array) -> Box | None:
         """Torques, gravity ``g`` included, that box and rate allow after the last one; None if rates are not limited.

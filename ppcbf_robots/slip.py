@@ -92,7 +92,7 @@ class SlipBatch:
 
     def __init__(self, dt: float, time: float, count: int) -> None:
         self.dt, self.time = dt, time
-        self._t = np.full(count, -np.inf)  # of the last step that was applied
+        self._t = np.full(count, -np.inf)  # of the last step, where it says what to expect
         self._slip: Array | None = None
         self._before: list[Array] = []  # phi, L_f phi, L_g phi and torque then
 
@@ -106,14 +106,12 @@ class SlipBatch:
         return BarrierRows(rows.h, rows.hdot, rows.phi, rows.Lf_phi - np.maximum(self._slip, 0.0), rows.Lg_phi, rows.w)
 
     def applied(self, t: float, rows: BarrierRows, u: Array, short: Array, which: NDArray[np.bool_]) -> None:
-        """Torques u (B, nv), gravity included, are applied from t on in the runs ``which`` (B,); ``short`` is (B,)."""
-        now = [rows.phi, rows.Lf_phi - short[:, None], rows.Lg_phi, u]
-        if self._before and not which.all():
-            now = [
-                np.where(which.reshape(-1, *[1] * (x.ndim - 1)), x, y) for x, y in zip(now, self._before, strict=True)
-            ]
-        self._before = now
-        self._t = np.where(which, t, self._t)
+        """Torques u (B, nv), gravity included, are applied from t on in the runs ``which`` (B,); ``short`` is (B,).
+
+        The other runs' next states are compared with nothing.
+        """
+        self._before = [rows.phi, rows.Lf_phi - short[:, None], rows.Lg_phi, u]
+        self._t = np.where(which, t, -np.inf)
 
 
 @kernel

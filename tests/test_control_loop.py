@@ -152,6 +152,24 @@ def test_nothing_is_learned_across_a_gap_or_another_barrier():
         np.testing.assert_array_equal(observer.wary(t, later).Lf_phi, 0.0)
 
 
+@pytest.mark.parametrize("wrong", ["u_des", "state"])
+def test_nothing_is_learned_from_a_step_whose_torque_was_another(two_link, wrong):
+    """After one step of FAULT or INVALID the next state is no slip of what the step before had predicted."""
+    filter_, engine = make(two_link), PinocchioEngine(two_link.model)
+    engine.reset(two_link.robot.start, np.array([0.5, -0.5]))
+    slips = []
+    for i in range(30):
+        q, v = engine.state()
+        nominal = two_link.robot.controller.evaluate(two_link.model.evaluate(q, v))
+        bad = i == 20
+        u_des = np.full(2, np.nan) if bad and wrong == "u_des" else nominal.u + 20.0 * np.sin(i)
+        result = filter_.step(i * DT, np.full(2, np.nan) if bad and wrong == "state" else q, v, u_des)
+        assert (result.status >= Status.FAULT) == bad
+        slips.append(float(np.abs(filter_._slip._slip).max(initial=0.0)))
+        engine.advance(result.u, 5e-4, 2)
+    assert max(slips[21:]) < 1.5 * max(slips[:20])
+
+
 def least_phi(problem, plant, dt, **config):
     """Least phi and h between and at the control instants, and the rise of V, of the robot's own run of 1.2 s."""
     filter_, engine = make(problem, dt=dt, **config), PinocchioEngine(plant)

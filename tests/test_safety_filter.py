@@ -10,13 +10,17 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ppcbf_robots.engines import PinocchioEngine
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.problem import load_problem
 from ppcbf_robots.qp import make_solver
+from ppcbf_robots.qp_filter import QPRows
+from ppcbf_robots.resources import find_world
 from ppcbf_robots.rollout import simulate
 from ppcbf_robots.safety_filter import SafetyFilter, StepResult
 from ppcbf_robots.shapes import Motion
@@ -300,6 +304,38 @@ def test_a_ball_driven_across_a_moving_arm_is_avoided(panda):
     assert least > -1e-3
     assert torque <= 1.0 + 1e-9
     assert Status.CORRECTING in statuses
+
+
+def test_a_far_obstacle_that_comes_closer_is_no_reason_to_give_up_passivity(two_link, tmp_path):
+    """Only rows that u_des really breaks are; where the world's own circle asks for energy, that is an alarm."""
+    far = {"name": "far", "type": "sphere", "center": [8.0, 0.0, 0.0], "radius": 0.1}
+    world = yaml.safe_load(find_world("circle").read_text())
+    (tmp_path / "w.yaml").write_text(yaml.safe_dump({"obstacles": [*world["obstacles"], far]}))
+    problem = load_problem("two_link", str(tmp_path / "w.yaml"))
+    model, rng, dropped = problem.model, np.random.default_rng(0), 0
+    motion = {"far": Motion(xyz=np.array([8.0, 0.0, 0.0]), velocity=np.array([-0.14, 0.0, 0.0]))}
+    for _ in range(500):
+        q, v = model.from_angles(problem.robot.domain.sample_q(rng, 1)[0]), problem.robot.domain.sample_v(rng, 1)[0]
+        u = model.gravity(q) + rng.uniform(-1.0, 1.0, 2) * model.u_max
+        alone, beside = (
+            SafetyFilter(model, problem.safety, problem.barrier("lb-cbf")).step(0.0, q, v, u, 0.0, motions)
+            for motions in (None, motion)
+        )
+        assert beside.port_power == 0.0 and beside.status == alone.status
+        np.testing.assert_allclose(beside.u, alone.u, atol=1e-6)
+        dropped += alone.status is Status.PASSIVITY_DROPPED
+    assert dropped > 3
+
+
+def test_the_least_violation_is_that_of_all_rows(panda):
+    """Sixteen rows ask z0 for 0.8 and above, one more for -0.5 and below: the middle serves all of them best."""
+    filter_ = SafetyFilter(panda.model, panda.safety, panda.barrier("lb-cbf")).correction
+    C, ones = np.zeros((17, 7)), np.ones(17)
+    C[:, 0], lower = np.append(ones[:16], -1.0), np.append(0.8 + 0.01 * np.arange(16), 0.5)
+    box = -np.ones(7), np.ones(7)
+    qp = QPRows(C, lower, ones, ones > 0.0, np.arange(17), 17, np.eye(7), box, "box")
+    z = filter_._least_violation(qp)
+    assert float((lower - C @ z).max()) == pytest.approx(0.5 * (0.95 + 0.5), abs=1e-3)
 
 
 def test_without_its_motion_the_same_ball_hits(panda, monkeypatch):
