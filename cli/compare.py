@@ -70,6 +70,10 @@ def compare(
             report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
         else:
             err.print(f"{name}: taken from {folder}", style="dim", soft_wrap=True)
+        if report["interrupted"]:
+            raise KeyboardInterrupt
+        if not report.get("saved", True):
+            raise CheckFailed(f"{name}: {report['reason']}; what is in {folder} is another barrier")
         failed += [] if report["converged"] else [f"{name}: {report['reason']}"]
     rows, runs, barriers = _run_all(problem, out_dir, duration)
     files = _write(problem, rows, runs, barriers, out_dir)
@@ -90,10 +94,13 @@ def _earlier(
         stored.barrier(problem)
     except InputError:
         return None
+    from ppcbf_robots.learning.presets import PRESETS
+    from ppcbf_robots.learning.train import with_gamma
+
     training = stored.data["training"]
-    wanted = {"preset": preset, "seed": seed, "kind": kind, "iterations": iterations}
+    wanted = {"preset": preset, "seed": seed, "kind": kind, "iterations": iterations, "interrupted": False}
     goal = problem.model.to_angles(problem.robot.goal).tolist()
-    same = stored.spec == problem.robot.spec.barrier and stored.data.get("goal") == goal
+    same = stored.spec == with_gamma(problem, PRESETS[preset]).robot.spec.barrier and stored.data.get("goal") == goal
     return training if same and wanted == {k: training.get(k) for k in wanted} else None
 
 

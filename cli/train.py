@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,15 +13,14 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ppcbf_robots.artefact import save_barrier
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.robot import RobotModel
-from ppcbf_robots.specs import Array
+from ppcbf_robots.specs import Array, BarrierSpec, validate
 
 if TYPE_CHECKING:
-    from ppcbf_robots.learning.train import Monitor, Result
+    from ppcbf_robots.learning.train import Monitor
 
 Kind = Literal["pp-ncbf", "ncbf"]
 PresetChoice = Literal["default", "paper"]
@@ -55,9 +53,8 @@ def train(
     """
     problem = load_problem(robot, obstacles)
     if gamma is not None:
-        if not 0.0 < gamma < math.inf:
-            raise InputError(f"--gamma must be positive and finite, got {gamma}")
-        problem = problem.with_barrier_spec(problem.robot.spec.barrier.model_copy(update={"gamma": gamma}))
+        given = problem.robot.spec.barrier.model_dump(exclude_unset=True) | {"gamma": gamma}
+        problem = problem.with_barrier_spec(validate(given, BarrierSpec, "--gamma"))
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
     for warning in problem.model.warnings:
@@ -71,7 +68,8 @@ def train(
     else:
         _print(report)
     if not report["converged"]:
-        raise CheckFailed(f"not converged: {report['reason']}; the best barrier so far is in {out_dir}")
+        where = f"the best barrier so far is in {out_dir}" if report["saved"] else f"nothing was written to {out_dir}"
+        raise CheckFailed(f"not converged: {report['reason']}; {where}")
 
 
 def load_states(path: Path, model: RobotModel) -> tuple[Array, Array]:
@@ -111,7 +109,8 @@ def train_barrier(
 
     from ppcbf_robots.learning.checkpoint import load_checkpoint, save_checkpoint
     from ppcbf_robots.learning.presets import PRESETS
-    from ppcbf_robots.learning.train import Trainer, settings
+    from ppcbf_robots.learning.store import store
+    from ppcbf_robots.learning.train import Trainer
 
     chosen = PRESETS[preset_name]
     if iterations is not None:
@@ -136,25 +135,9 @@ def train_barrier(
             save_checkpoint(trainer, folder)
 
         result = trainer.run(on_check, time_limit, on_refine=lambda text: err.print(text, style="yellow"))
-    report = result.report() | {
-        "preset": preset_name,
-        "seed": seed,
-        "device": where,
-        "kind": kind,
-        "iterations": iterations,
-    }
-    details = {**report, "settings": settings(chosen), "history": _history(result)}
-    if result.check.samples == 0 and (folder / "barrier.json").is_file():
-        err.print(f"{folder}: the barrier already there is kept, for the new one could not be checked")
-    else:
-        save_barrier(folder, trainer.problem, kind, chosen.network, result.params, trainer.filter_config, details)
-    return {**report, "out": str(folder)}
-
-
-def _history(result: Result) -> list[dict[str, Any]]:
-    keys = ("iteration", "volume_kept", "band_yield", "torque", "passivity", "loss", "start_inside", "seconds")
-    rows = [{k: getattr(m, k) for k in keys} for m in result.history]
-    return [row | {"loss": row["loss"] if math.isfinite(row["loss"]) else None} for row in rows]  # JSON has no NaN
+    facts = {"preset": preset_name, "seed": seed, "device": where, "kind": kind, "iterations": iterations}
+    saved = store(trainer, result, folder, facts)
+    return {**result.report(), **facts, "saved": saved, "out": str(folder)}
 
 
 @contextlib.contextmanager
@@ -216,4 +199,6 @@ def _print(report: dict[str, Any]) -> None:
             f"the falsifier found {what} without a feasible torque; least reserve {report['worst_margin']:.4f} "
             f"of {report['attacked']} tried"
         )
-    out.print(f"wrote {report['out']}/barrier.json and {report['out']}/weights.safetensors")
+    folder = report["out"]
+    out.print(f"wrote {folder}/barrier.json and {folder}/weights.safetensors" if report["saved"]
+              else f"kept the barrier that was in {folder}: of the new one nothing is known")  # fmt: skip

@@ -64,6 +64,7 @@ class Result:
     steps: int
     seconds: float
     history: list[Monitor]
+    interrupted: bool  # by Ctrl-C
 
     def report(self) -> dict[str, Any]:
         """The keys of ``ppcbf train --json``, without the folder."""
@@ -79,6 +80,7 @@ class Result:
             "start_inside": self.start_inside,
             "seconds": round(self.seconds, 2),
             "steps": self.steps,
+            "interrupted": self.interrupted,
         }
 
 
@@ -294,7 +296,7 @@ class Trainer:
         converged = reason == "clean" or reason.startswith("interrupted")
         seconds = time.monotonic() - self.started
         return Result(best.params, converged, reason, volume, check, best.attack, start_inside, descent.iteration,
-                      seconds, self.history)  # fmt: skip
+                      seconds, self.history, interrupted)  # fmt: skip
 
 
 def _said(tested: Tested) -> str:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ppcbf_robots.artefact import save_barrier
 from ppcbf_robots.learning.presets import Preset, PresetName
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.sweep import Task
@@ -51,11 +50,11 @@ class Training:
         """Train with one thread, write the barrier if it is wanted, and report as JSON."""
         import torch  # in the worker alone
 
+        from ppcbf_robots.learning.store import store
         from ppcbf_robots.learning.train import Trainer
 
         torch.set_num_threads(1)
-        problem = load_problem(self.robot, self.world)
-        trainer = Trainer(problem, KIND, self.preset, self.seed, "cpu")
+        trainer = Trainer(load_problem(self.robot, self.world), KIND, self.preset, self.seed, "cpu")
         result = trainer.run(time_limit=self.time_limit)
         report = {
             "converged": result.converged,
@@ -78,8 +77,7 @@ class Training:
             ],
         }
         if self.folder is not None:
-            details = {**report, "preset": self.preset_name, "seed": self.seed, "device": "cpu", "kind": KIND,
-                       "iterations": self.preset.iterations, "start_inside": result.start_inside}  # fmt: skip
-            config = trainer.filter_config
-            save_barrier(self.folder, problem, KIND, self.preset.network, result.params, config, details)
+            facts = {"preset": self.preset_name, "seed": self.seed, "device": "cpu", "kind": KIND,
+                     "iterations": self.preset.iterations}  # fmt: skip
+            store(trainer, result, self.folder, facts)
         return report
