@@ -152,16 +152,16 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     work, rates = _push_work(problem.model, case, run)[known], run.rate_ratios(problem.model)
     unexplained = run.V[known] - work
     rise = float(np.max(unexplained) - unexplained[0])
-    h, pairs = run.h[known], run.clearance[known]
-    clearance = float(pairs.min())
+    h, clearance = run.h[known], float(run.clearance[known].min())
     steps = {status: int(np.sum(run.status == status)) for status in Status}
     failures = steps[Status.INFEASIBLE] + steps[Status.FAULT]
-    beyond = h[h < pairs] < -LIMIT_TOLERANCE  # where some joint limit is nearer than any pair
+    angles = problem.model.to_angles(run.q[known])
+    beyond = [sign * (angles[:, i] - bound) < -LIMIT_TOLERANCE for i, sign, bound in problem.safety.limits]
     return {
         "min_h": float(h.min()),
         "clearance": clearance,
         "contact": clearance < 0.0 if contacts is None else contacts["steps"] > 0,
-        "beyond_limit": bool(beyond.any()),
+        "beyond_limit": bool(np.any(beyond)),
         "torque": float(np.max(np.abs(run.u[known]) / problem.model.u_max)),
         "rate": 0.0 if rates is None else float(rates[known[1:] & known[:-1]].max(initial=0.0)),
         "energy_rise": rise,

@@ -96,10 +96,11 @@ def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain)
     fastest = np.abs(domain.v).max(axis=1)
     room = np.maximum(robot.u_max - g_max, 0.05 * robot.u_max)
     kd = _stable_damping(np.minimum(DAMPING_SHARE * room / fastest, DAMPING_RATE * inertia), Minvs)
-    kp = np.minimum(SPRING_RATE * kd, kd**2 / inertia)
-    names = robot.joint_names
-    kp = kp if spec.kp is None else per_joint(spec.kp, names, "controller.kp", kp)
+    names, derived = robot.joint_names, kd
     kd = kd if spec.kd is None else per_joint(spec.kd, names, "controller.kd", kd)
+    damping = np.where(kd > 0.0, kd, derived)  # an undamped joint may have a spring
+    kp = np.minimum(SPRING_RATE * damping, damping**2 / inertia)
+    kp = kp if spec.kp is None else per_joint(spec.kp, names, "controller.kp", kp)
     f_max = SPRING_SHARE * np.maximum(robot.u_max - g_max - kd * fastest, 0.05 * robot.u_max)
     f_max = np.minimum(f_max, inertia * fastest / SPRING_TIME)
     f_max = f_max if spec.max_spring is None else per_joint(spec.max_spring, names, "controller.max_spring", f_max)

@@ -244,7 +244,7 @@ def judge(loop: Loop, messages: Sequence[str], first: int) -> Outcome:
               if r.status >= Status.PASSIVITY_DROPPED and (a is None or a.status is not r.status)]  # fmt: skip
     back_ms = None
     if np.isfinite(fault.lasts):
-        later = np.flatnonzero(statuses[first + round(fault.lasts / dt) :] < Status.FAULT)
+        later = np.flatnonzero(statuses[first + round(fault.lasts / dt) :] <= Status.PASSIVITY_DROPPED)
         back_ms = 1e3 * dt * float(later[0]) if len(later) else np.inf
     V = np.array(loop.V)
     return Outcome(

@@ -186,7 +186,8 @@ def test_what_goes_wrong_is_counted(two_link):
     clean = found()
     assert not clean["contact"] and clean["torque"] <= 1.0 and clean["fallbacks"] == 0
     assert found(clearance=good.clearance - 10.0 * bump, h=good.h - 10.0 * bump)["contact"]
-    assert found(h=good.h - 10.0 * bump)["beyond_limit"] and not found(h=good.h - 10.0 * bump)["contact"]
+    assert not clean["beyond_limit"] and not found(h=good.h - 10.0 * bump)["contact"]
+    assert found(q=good.q + 10.0 * bump[:, None])["beyond_limit"]  # whatever else is nearer
     assert found(u=good.u + 1e3 * bump[:, None])["torque"] > 1.0
     assert found(V=good.V + 7.0 * bump)["injected"] == pytest.approx(7.0, abs=0.1)
     failed = found(status=np.where(bump > 0, Status.INFEASIBLE, 0))

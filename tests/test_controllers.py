@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ppcbf_robots.controllers import Gains, NominalController
-from ppcbf_robots.derive import derive_gains
+from ppcbf_robots.derive import SPRING_RATE, derive_gains
 from ppcbf_robots.problem import load_robot
+from ppcbf_robots.specs import ControllerSpec
 
 KINDS = ["pd_gravity", "shaping", "bounded_spring"]
 DT = 1e-3  # [s], control period the derived gains must suit
@@ -100,6 +101,17 @@ def test_derived_gains_fit_the_torque_box_and_the_control_period(problems, state
         dyn = model.evaluate(q, v)
         assert np.all(np.abs(controller.evaluate(dyn).u) <= 1.02 * model.u_max)
         assert np.abs(np.linalg.eigvals(dyn.Minv * kd)).max() * DT < 1.0
+
+
+def test_the_derived_spring_suits_the_damping_that_is_given(panda):
+    """A damping ratio of 0.5 on the mean inertia, whichever damping that is; an undamped joint has the derived one."""
+    model, domain = panda.model, panda.robot.domain
+    own = derive_gains(model, None, domain)
+    half = derive_gains(model, ControllerSpec(kd=(0.5 * own.kd).tolist()), domain)
+    bent = own.kp < SPRING_RATE * own.kd * (1.0 - 1e-9)  # where the ratio, not the rate, bounds the spring
+    assert bent.any()
+    np.testing.assert_allclose(half.kp[bent], 0.25 * own.kp[bent])
+    np.testing.assert_array_equal(derive_gains(model, ControllerSpec(kd=0.0), domain).kp, own.kp)
 
 
 @pytest.mark.parametrize("name", ["panda", "kinova", "xarm7"])
