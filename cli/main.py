@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 
 import typer
@@ -32,7 +31,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Train and run passivity-preserving neural control barrier functions for torque-controlled robot arms.\n\n"
-    "Exit codes: 0 done, 2 wrong use or bad input, 3 not converged or a check failed, 130 stopped by Ctrl-C.",
+    "Exit codes: 0 done, 1 the reader of a pipe has gone, 2 wrong use or bad input, 3 not converged or a check failed, "
+    "130 stopped by Ctrl-C.",
 )
 for command in (info, train, simulate, campaign, compare, view, export, convert, sweep, verify, report, faults):
     app.command()(command)
@@ -48,12 +48,6 @@ def main() -> None:
     except PPCBFError as error:
         err.print(Text.assemble(("error:", "bold red"), " ", str(error)), soft_wrap=True)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        err.print("stopped")
-        sys.exit(130)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
 
 
 if __name__ == "__main__":
