@@ -126,6 +126,33 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(cartpole, preset, tmp_path)
     assert dataclasses.astuple(result.check)[:3] == dataclasses.astuple(whole.check)[:3]
 
 
+def test_a_resumed_run_still_has_the_barrier_that_stood_before_the_refinement(panda, monkeypatch, tmp_path):
+    """Stopped hard while it refined for a larger set: the one that stands, and how often was refined, come back."""
+    monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: BandCheck(300, 0, 300))
+    monkeypatch.setattr(Trainer, "_stands", lambda self, t, share=0.2: t.clean)
+    found, none = np.zeros((3, 7)), np.zeros((0, 7))
+    attacks = [Attack(-0.1, found, found, 10), Attack(0.3, none, none, 10)]
+
+    def descend(self, on_check, time_limit):
+        if self.round == 1:
+            save_checkpoint(self, tmp_path)
+            raise ConnectionAbortedError  # as if the process had died
+        self.clean = [(0.9, self.descent.snapshot()), (0.8, self.descent.snapshot())]
+
+    monkeypatch.setattr(Trainer, "_descend", descend)
+    monkeypatch.setattr(MarginDescent, "attack", lambda self, *given: attacks.pop(0))
+    dying = Trainer(panda, "pp-ncbf", TINY)
+    with pytest.raises(ConnectionAbortedError):
+        dying.run()
+    monkeypatch.setattr(Trainer, "_descend", lambda self, *given: None)
+    resumed = Trainer(panda, "pp-ncbf", TINY)
+    load_checkpoint(resumed, tmp_path)
+    assert resumed.round == dying.round == 1
+    result = resumed.run()  # nothing larger is found
+    assert result.converged and (result.attack.worst, result.check.samples) == (0.3, 300)
+    assert_same_weights(result.params, dying.best.params)
+
+
 @pytest.mark.parametrize("preset", [TINY, TINY_PAPER], ids=["default", "paper"])
 def test_a_checkpoint_keeps_counterexamples(cartpole, preset, tmp_path):
     """Buffers and lists point at rays, so those that refinement added must come back."""

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.learning.train import Monitor, Trainer
+from ppcbf_robots.evidence import BandCheck
+from ppcbf_robots.learning.falsifier import Attack
+from ppcbf_robots.learning.train import Monitor, Tested, Trainer
 
 FILE = "checkpoint.safetensors"
-FORMAT = 3  # of the file; one of another format belongs to another version
+FORMAT = 4  # of the file; one of another format belongs to another version
 AGAIN = "train from the start without --resume"
 
 
@@ -31,6 +35,11 @@ def save_checkpoint(trainer: Trainer, folder: Path) -> None:
     for j, (volume, params) in enumerate(trainer.clean):
         tensors |= {f"clean/{j}/{k}": torch.as_tensor(x) for k, x in params.items()}
         tensors[f"clean/{j}/volume"] = torch.tensor(volume)
+    best = trainer.best
+    if best is not None:
+        tensors |= {f"best/params/{k}": torch.as_tensor(x) for k, x in best.params.items()}
+    if best is not None and best.attack is not None:
+        tensors |= {"best/q": torch.as_tensor(best.attack.q), "best/v": torch.as_tensor(best.attack.v)}
     state = {
         "format": FORMAT,
         "identity": trainer.identity(),
@@ -38,6 +47,10 @@ def save_checkpoint(trainer: Trainer, folder: Path) -> None:
         "planned": descent.planned,
         "descent": numbers,
         "rng": descent.rng.bit_generator.state,
+        "round": trainer.round,
+        "gained": trainer.gained,
+        "seconds": time.monotonic() - trainer.started,
+        "best": None if best is None else _numbers_of(best),
         "history": [dataclasses.asdict(monitor) for monitor in trainer.history],
     }
     tensors = {k: x.detach().cpu().contiguous().clone() for k, x in tensors.items()}
@@ -91,6 +104,28 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
     descent.iteration, descent.planned = state["iteration"], state["planned"]
     descent.rng.bit_generator.state = state["rng"]
     trainer.history = [Monitor(**monitor) for monitor in state["history"]]
+    trainer.round, trainer.gained = state["round"], state["gained"]
+    trainer.started = time.monotonic() - state["seconds"]
+    trainer.best = None if state["best"] is None else _tested(state["best"], _below(tensors, "best/"))
+
+
+def _numbers_of(best: Tested) -> dict[str, Any]:
+    """What is known of the best barrier so far; its violating states have joined the rays."""
+    check, attack = best.check, best.attack
+    return {
+        "volume_kept": best.volume_kept,
+        "check": [check.samples, check.violations, check.tried],
+        "attack": None if attack is None else [attack.worst, attack.evaluated],
+    }
+
+
+def _tested(numbers: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Tested:
+    params = {k: x.numpy() for k, x in _below(tensors, "params/").items()}
+    attack = None
+    if numbers["attack"] is not None:
+        worst, evaluated = numbers["attack"]
+        attack = Attack(worst, tensors["q"].numpy(), tensors["v"].numpy(), evaluated)
+    return Tested(params, BandCheck(*numbers["check"]), attack, numbers["volume_kept"])
 
 
 def _below(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

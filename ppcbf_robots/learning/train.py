@@ -126,6 +126,9 @@ class Trainer:
         self.filter_config = self.descent.filter_config
         self.history: list[Monitor] = []
         self.clean: list[tuple[float, dict[str, Array]]] = []  # (volume kept, parameters), best first
+        self.round = -1 if preset.judge_first else 0  # before the first one the LB-CBF is judged
+        self.best: Tested | None = None
+        self.gained = 0  # rounds that left a set that stands
         self.started = time.monotonic()
 
     def identity(self) -> str:
@@ -146,12 +149,10 @@ class Trainer:
         KeyboardInterrupt ends training and judges the best barrier so far.
         """
         interrupted = False
-        tested: list[Tested] = []
-        gained = 0
-        at_once = self.preset.judge_first and self.descent.iteration == 0
-        for round_ in range(-1 if at_once else 0, self.preset.refinements + 1):
+        while True:
+            at_once = self.round < 0
             try:
-                if round_ < 0:
+                if at_once:
                     self.clean = [(1.0, without_term(self.descent.snapshot()))]
                 else:
                     self._descend(on_check, time_limit)
@@ -161,27 +162,27 @@ class Trainer:
                 found = self._evidence()
             except KeyboardInterrupt:
                 found, interrupted = [], True
-            if round_ < 0:  # where the LB-CBF is not clean, its search was cut short
-                tested = [t for t in found if self._stands(t, 1.0)]
-            else:
-                tested += found
-            tested = sorted(tested, key=lambda t: (not self._stands(t), *t.order))
+            kept = [t for t in found if self._stands(t, 1.0)] if at_once else found  # else its search was cut short
+            candidates = kept if self.best is None else [self.best, *kept]
+            self.best = min(candidates, key=lambda t: (not self._stands(t), *t.order), default=None)
             out_of_time = time.monotonic() - self.started > time_limit
-            enough = bool(tested) and self._stands(tested[0])
-            gained += enough
-            larger = enough and any(t.volume_kept > tested[0].volume_kept for t in found)  # that did not stand
-            last = round_ == self.preset.refinements or (enough and not (larger and gained <= GAIN_ROUNDS))
+            best = self.best
+            enough = best is not None and self._stands(best)
+            self.gained += enough
+            larger = best is not None and any(t.volume_kept > best.volume_kept for t in found)  # that did not stand
+            last = self.round == self.preset.refinements or (enough and not (larger and self.gained <= GAIN_ROUNDS))
             if last or interrupted or out_of_time:
                 break
-            if round_ < 0:
+            self.round += 1
+            if at_once:
                 self._join(found)
                 continue
             self._refine(found, demanding=not enough)
             if on_refine is not None:
                 wrong = _said(found[0]) if found else "no clean barrier was found"
                 on_refine(f"{wrong}: refining{', for a larger set than the one that stands' if enough else ''}")
-        best = tested[0] if tested else Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
-        return self._result(best, interrupted)
+        unknown = Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
+        return self._result(self.best or unknown, interrupted)
 
     def _stands(self, tested: Tested, share: float = RESERVE_SHARE) -> bool:
         """Whether it is clean and, where states cannot be covered, keeps that share of the reserve training asks for.
