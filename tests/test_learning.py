@@ -271,7 +271,7 @@ def test_a_collapsed_set_is_not_converged(cartpole):
     with torch.no_grad():
         trainer.descent.params["w_out"] *= 1e4
     result = trainer.run()
-    assert not result.converged
+    assert not result.converged and trainer.preset.refinements > trainer.round == 0  # there is nothing to refine
     assert result.volume_kept < trainer.preset.min_volume
     assert result.reason == f"collapsed: the safe set keeps {result.volume_kept:.1%} of the LB set"
 

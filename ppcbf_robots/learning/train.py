@@ -171,7 +171,8 @@ class Trainer:
             self.gained += enough
             larger = best is not None and any(t.volume_kept > best.volume_kept for t in found)  # that did not stand
             last = self.round == self.preset.refinements or (enough and not (larger and self.gained <= GAIN_ROUNDS))
-            if last or interrupted or out_of_time:
+            collapsed = not enough and not at_once and self.descent.volume_kept() < self.preset.min_volume
+            if last or interrupted or out_of_time or collapsed:  # a refinement of what has collapsed only shrinks it
                 break
             self.round += 1
             if at_once:
