@@ -16,7 +16,7 @@ from ppcbf_robots.world import WorldSpec
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 SMALLER = {
-    "train": ["--iterations", "40"],
+    "train": ["--iterations", "40", "--time-limit", "10"],
     "simulate": ["--duration", "0.2"],
     "bench": ["--steps", "100"],
     "bench train": ["--iterations", "10"],
