@@ -26,6 +26,8 @@ from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_s
 from ppcbf_robots.world import Obstacle, WorldSpec
 from ppcbf_robots.world_files.load import load_world
 
+CLEAR = 0.05  # [m | rad] of everything, where a start is looked for
+STARTS = 2_000  # configurations among which it is
 GUARDED = 0.99  # of X's velocities, where the filter's rows hold them: room for what happens within a control period
 
 
@@ -165,10 +167,29 @@ def load_robot(name: str) -> Robot:
 
 
 def load_problem(robot: str, world: str) -> Problem:
-    """A robot and a world by name or path; InputError where they do not fit."""
+    """A robot and a world by name or path; InputError where they do not fit.
+
+    A derived start that violates a row of this world gives way to the nearest of some random ones that do not.
+    """
     loaded = load_robot(robot)
     spec = load_world(find_world(world))
-    return Problem(loaded, world, spec, loaded.safety(spec.obstacles))
+    problem = Problem(loaded, world, spec, loaded.safety(spec.obstacles))
+    return _with_clear_start(problem) if "start" in loaded.derived else problem
+
+
+def _with_clear_start(problem: Problem) -> Problem:
+    robot, model, domain = problem.robot, problem.model, problem.robot.domain
+    h, row = problem.safety.least(robot.start)
+    if h >= 0.0:
+        return problem
+    angles = domain.sample_q(np.random.default_rng(SAMPLE_SEED), STARTS)
+    clear = np.flatnonzero(problem.safety.first_order(model.from_angles(angles))[0].min(axis=1) >= CLEAR)
+    if not len(clear):
+        return problem
+    way = (angles[clear] - model.to_angles(robot.start)) / np.ptp(domain.q, axis=1)
+    start = model.from_angles(angles[clear[np.argmin(np.linalg.norm(way, axis=1))]])
+    model.warnings.append(f"the start that suits most worlds violates '{row}' by {-h:.4f}: another one was taken")
+    return dataclasses.replace(problem, robot=dataclasses.replace(robot, start=start))
 
 
 def _spec_urdf(path: Path, spec: RobotSpec) -> Path:

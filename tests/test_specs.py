@@ -384,6 +384,24 @@ def test_start_inside_an_obstacle_or_beyond_a_limit(files):
     )
 
 
+def test_a_derived_start_gives_way_to_what_stands_there(files, tmp_path):
+    """The nearest of many clear ones, the same every time; a start that is given stays where it is."""
+    at_zero = "{name: post, type: sphere, center: [0.46, 0.05, 0.15], radius: 0.1}"
+    (tmp_path / "post.yaml").write_text(f"obstacles: [{at_zero}]\n")
+    free, problem, again = (load_problem("ur3", w) for w in ("sphere", *2 * [str(tmp_path / "post.yaml")]))
+    model = problem.model
+    blocked = problem.safety.least(free.robot.start)
+    assert blocked[0] < 0.0 and problem.safety.least(problem.robot.start)[0] >= 0.05
+    np.testing.assert_array_equal(problem.robot.start, again.robot.start)
+    np.testing.assert_array_equal(problem.robot.controller.goal, free.robot.controller.goal)
+    assert problem.fingerprint()["task"] == free.fingerprint()["task"]
+    said = f"the start that suits most worlds violates '{blocked[1]}' by {-blocked[0]:.4f}: another one was taken"
+    assert model.warnings[-1] == said and said not in free.model.warnings
+    (tmp_path / "given.yaml").write_text(f"urdf: ur3_robot\nstart: {[0.0] * 6}\neffort: 50\n")
+    given = load_problem(str(tmp_path / "given.yaml"), str(tmp_path / "post.yaml"))
+    np.testing.assert_array_equal(model.to_angles(given.robot.start), 0.0)
+
+
 @pytest.mark.parametrize(
     ("text", "values"),
     [("1, 2", [1.0, 2.0]), ("-1e-3", [-0.001]), ("1.5,-2,", [1.5, -2.0]), (None, None)],
