@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shlex
 import sys
@@ -11,6 +12,7 @@ import pytest
 import yaml
 
 from ppcbf_robots.cli.main import main
+from ppcbf_robots.learning.presets import PRESETS
 from ppcbf_robots.specs import RobotSpec
 from ppcbf_robots.world import WorldSpec
 
@@ -30,6 +32,10 @@ SMALLER = {
     "study safe-set": ["--samples", "200", "--boundary", "10", "--nodes", "9"],
     "study nmpc": ["--grid", "3", "--steps", "10", "--nodes", "9"],
 }
+
+
+LESS = {"rays": 3000, "test_samples": 500, "refinements": 1}  # of what training looks at
+SHORTER = {"search_rounds": 1, "attack_rounds": 5}  # searches, where there are any
 
 
 def blocks(language: str) -> list[str]:
@@ -72,6 +78,9 @@ def test_the_readme_names_every_command() -> None:
 @pytest.mark.slow
 def test_commands_and_python_run_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    for name, preset in PRESETS.items():
+        fewer = LESS | {k: n for k, n in SHORTER.items() if getattr(preset, k)}
+        monkeypatch.setitem(PRESETS, name, dataclasses.replace(preset, **fewer))
     for arguments in commands():
         monkeypatch.setattr(sys, "argv", ["ppcbf", *arguments, *SMALLER.get(name_of(arguments), [])])
         with pytest.raises(SystemExit) as exit_info:
