@@ -58,7 +58,7 @@ def train(
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
     for warning in problem.model.warnings:
-        err.print(f"warning: {warning}", style="yellow")
+        err.print(f"warning: {warning}", style="yellow", soft_wrap=True)
     states = None if counterexamples is None else load_states(counterexamples, problem.model)
     report = train_barrier(
         problem, barrier, preset, seed, out_dir, device, iterations, time_limit, resume, tensorboard, states
