@@ -68,12 +68,12 @@ def compare(
         report = _earlier(folder, problem, kind, preset, seed, iterations) if reuse else None
         if report is None:
             report = train_barrier(problem, kind, preset, seed, folder, device, iterations)
+            if report["interrupted"]:
+                raise KeyboardInterrupt
+            if not report["saved"]:
+                raise CheckFailed(f"{name}: {report['reason']}; what is in {folder} is another barrier")
         else:
             err.print(f"{name}: taken from {folder}", style="dim", soft_wrap=True)
-        if report["interrupted"]:
-            raise KeyboardInterrupt
-        if not report.get("saved", True):
-            raise CheckFailed(f"{name}: {report['reason']}; what is in {folder} is another barrier")
         failed += [] if report["converged"] else [f"{name}: {report['reason']}"]
     rows, runs, barriers = _run_all(problem, out_dir, duration)
     files = _write(problem, rows, runs, barriers, out_dir)
@@ -94,8 +94,7 @@ def _earlier(
         stored.barrier(problem)
     except InputError:
         return None
-    from ppcbf_robots.learning.presets import PRESETS
-    from ppcbf_robots.learning.train import with_gamma
+    from ppcbf_robots.learning.presets import PRESETS, with_gamma
 
     training = stored.data["training"]
     wanted = {"preset": preset, "seed": seed, "kind": kind, "iterations": iterations, "interrupted": False}

@@ -223,7 +223,7 @@ class SafetyFilter:
             log.warning("obstacles %s", "are elsewhere: K = 0 until they are back" if moved else "are back: K is, too")
 
     def _forget_step(self) -> None:
-        """The next state cannot be compared with what the last step predicted: another torque was sent."""
+        """The next state cannot be compared with what the last step predicted: torque or obstacles are others."""
         if self._slip is not None:
             self._slip.forget_step()
 
@@ -255,8 +255,7 @@ class SafetyFilter:
         """
         offset = 0.0 if self.gravity_included else dyn.g
         correction, total = self._blind_correction if moving else self.correction, u_des + offset
-        broken = correction.violated(rows, total, allowed is not None) if moving else np.zeros(0, dtype=np.bool_)
-        pushed = moving and bool(np.any(broken & (safety.drift < 0.0)))  # by what comes closer
+        pushed = moving and bool((correction.violated(rows, total, allowed is not None) & (safety.drift < 0.0)).any())
         content = Status.PASSIVITY_DROPPED if pushed else Status.CORRECTING
         c = self._correct(correction, dyn, safety, rows, wary, total, d_p, allowed, content)
         if c.status is Status.FAULT:

@@ -34,7 +34,7 @@ from ppcbf_robots.learning.margin_descent import (
 )
 from ppcbf_robots.learning.paper_descent import PaperDescent
 from ppcbf_robots.learning.parameters import HELD, INSIDE, MANY_JOINTS, without_term
-from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS, Preset
+from ppcbf_robots.learning.presets import DEFAULT, PAPER, PRESETS, Preset, with_gamma
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.learning.train import (
     CANDIDATES,
@@ -43,7 +43,6 @@ from ppcbf_robots.learning.train import (
     Result,
     Trainer,
     settings,
-    with_gamma,
 )
 from ppcbf_robots.learning.train import Tested as Judged  # pytest would take it for a test
 from ppcbf_robots.network import NumpyNetwork

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from ppcbf_robots.filters import FilterKind, Metric
 from ppcbf_robots.network import NetworkKind
+from ppcbf_robots.problem import Problem
 
 PresetName = Literal["paper", "default"]
 
@@ -101,3 +103,16 @@ DEFAULT = Preset(
 )
 
 PRESETS: dict[PresetName, Preset] = {"paper": PAPER, "default": DEFAULT}
+
+
+def with_gamma(problem: Problem, preset: Preset) -> Problem:
+    """The problem with the preset's gamma, where the robot spec gives none and the robot has few joints."""
+    spec = problem.robot.spec.barrier
+    if preset.gamma is None or "gamma" in spec.model_fields_set or problem.model.nv > preset.covered_joints:
+        return problem
+    return problem.with_barrier_spec(spec.model_copy(update={"gamma": preset.gamma}))
+
+
+def settings(preset: Preset) -> dict[str, Any]:
+    """A preset as plain JSON data, for the training report."""
+    return {k: list(x) if isinstance(x, tuple) else x for k, x in dataclasses.asdict(preset).items()}

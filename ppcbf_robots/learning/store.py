@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ppcbf_robots.artefact import save_barrier
-from ppcbf_robots.learning.train import Result, Trainer, settings
+from ppcbf_robots.learning.presets import settings
+from ppcbf_robots.learning.train import Result, Trainer
 
 HISTORY = ("iteration", "volume_kept", "band_yield", "torque", "passivity", "loss", "start_inside", "seconds")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from ppcbf_robots.learning.falsifier import Attack
 from ppcbf_robots.learning.margin_descent import MarginDescent
 from ppcbf_robots.learning.paper_descent import PaperDescent
 from ppcbf_robots.learning.parameters import without_term
-from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.learning.presets import Preset, settings, with_gamma
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
@@ -309,16 +308,3 @@ def _said(tested: Tested) -> str:
     if attack.worst >= 0.0:
         return f"the falsifier found states of a reserve of {attack.worst:.4f} only"
     return f"the falsifier found violating states, of a reserve of {attack.worst:.4f} at least"
-
-
-def with_gamma(problem: Problem, preset: Preset) -> Problem:
-    """The problem with the preset's gamma, where the robot spec gives none and the robot has few joints."""
-    spec = problem.robot.spec.barrier
-    if preset.gamma is None or "gamma" in spec.model_fields_set or problem.model.nv > preset.covered_joints:
-        return problem
-    return problem.with_barrier_spec(spec.model_copy(update={"gamma": preset.gamma}))
-
-
-def settings(preset: Preset) -> dict[str, Any]:
-    """A preset as plain JSON data, for the training report."""
-    return {k: list(x) if isinstance(x, tuple) else x for k, x in dataclasses.asdict(preset).items()}
