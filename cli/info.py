@@ -9,6 +9,7 @@ import typer
 from rich.text import Text
 
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, emit_json, number, obstacle_rows, out, table
+from ppcbf_robots.derive_body import Body
 from ppcbf_robots.evidence import check_band
 from ppcbf_robots.filters import FilterConfig, too_fast_for_rate
 from ppcbf_robots.problem import Problem, Robot, load_problem, load_robot
@@ -72,7 +73,8 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
         "derived": robot.derived,
         "body": [s.model_dump() for s in robot.body],
         "body_overestimate_mm": _overestimate(robot),
-        "body_links": _links(robot),
+        "body_links": _links(robot.cover),
+        "fixed_links": _links(robot.fixed),
         "start": model.to_angles(robot.start).tolist(),
         "goal": model.to_angles(robot.goal).tolist(),
         "domain": {"q": robot.domain.q.tolist(), "v": robot.domain.v.tolist()},
@@ -106,10 +108,10 @@ def _overestimate(robot: Robot) -> dict[str, float] | None:
     return None if cover is None else {"largest": _mm(cover.largest), "mean": _mm(cover.mean)}
 
 
-def _links(robot: Robot) -> list[dict[str, Any]]:
+def _links(cover: Body | None) -> list[dict[str, Any]]:
     """The same for every link, with the number of its spheres and of those that are left out."""
-    links = [] if robot.cover is None else robot.cover.links
-    return [{"link": x.link, "spheres": len(x.moving), "left_out": len(x.still), "largest": _mm(x.largest),
+    links = [] if cover is None else cover.links
+    return [{"link": x.link, "spheres": len(x.spheres), "left_out": len(x.left_out), "largest": _mm(x.largest),
              "mean": _mm(x.mean)} for x in links]  # fmt: skip
 
 
@@ -150,6 +152,10 @@ def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
         total = facts["body_overestimate_mm"]
         title = f"body reaches {total['largest']:.1f} mm beyond the geometry at most, {total['mean']:.1f} mm on average"
         table(title, ["link", "spheres", "left out", "largest", "mean"], fits)
+    if facts["fixed_links"]:
+        fits = [[x["link"], str(x["spheres"]), f"{x['largest']:.1f}", f"{x['mean']:.1f}"] for x in facts["fixed_links"]]
+        title = f"fixed to the base, {len(robot.self_pairs)} pairs of self-collision; beyond the geometry, mm"
+        table(title, ["link", "spheres", "largest", "mean"], fits)
     out.print("derived, not given: " + (", ".join(facts["derived"]) or "nothing"))
     out.print("start " + " ".join(f"{x:.3f}" for x in facts["start"]))
     out.print("goal  " + " ".join(f"{x:.3f}" for x in facts["goal"]))

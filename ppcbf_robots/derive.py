@@ -6,6 +6,7 @@ import numpy as np
 
 from ppcbf_robots.controllers import Gains
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.holdable import holdable
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, ControllerSpec, DomainSpec, per_joint
 
@@ -55,7 +56,10 @@ class Domain:
 
 
 def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
-    """Given bounds, else the URDF's position limits (half a turn where there are none) and ± the velocity limits."""
+    """Given bounds, else the URDF's position limits (half a turn where there are none) and ± the velocity limits.
+
+    Derived position ranges leave out postures that the motors cannot hold; see :func:`ppcbf_robots.holdable.holdable`.
+    """
     low, high = robot.q_lower, robot.q_upper
     lower = np.where(np.isfinite(low), low, np.minimum(-WIDE_TURN, high - 2.0 * WIDE_TURN))
     upper = np.where(np.isfinite(high), high, np.maximum(WIDE_TURN, low + 2.0 * WIDE_TURN))
@@ -63,9 +67,21 @@ def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
     for name, given in (("q", spec.q), ("v", spec.v)):
         if given is not None and len(given) != robot.nv:
             raise InputError(f"domain.{name}: expected {robot.nv} pairs, one per moving joint, got {len(given)}")
-    q = q if spec.q is None else np.asarray(spec.q, float)
+    q = _narrowed(robot, q) if spec.q is None else np.asarray(spec.q, float)
     v = v if spec.v is None else np.asarray(spec.v, float)
     return Domain(q, v)
+
+
+def _narrowed(robot: RobotModel, q: Array) -> Array:
+    """q (nv, 2) without the postures that cannot be held, which a warning names."""
+    box = holdable(robot, q)
+    for i in np.flatnonzero(np.any(box != q, axis=1)):
+        robot.warnings.append(
+            f"X has joint '{robot.joint_names[i]}' between {box[i, 0]:.2f} and {box[i, 1]:.2f} only, instead of "
+            f"{q[i, 0]:.2f} to {q[i, 1]:.2f}: beyond, gravity alone takes more than an effort limit in some postures; "
+            "give the true effort, or another domain.q"
+        )
+    return box
 
 
 def derive_gains(robot: RobotModel, spec: ControllerSpec | None, domain: Domain) -> Gains:

@@ -1,17 +1,19 @@
 """Body spheres of a robot from its URDF's geometry: a cover of every moving link, found once and kept.
 
 The geometry is the collision geometry; a link without one lends its visual geometry. What is fixed to the base is no
-part of the body.
+part of the body, and covered by itself.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from ppcbf_robots import body_cache, body_fit
 from ppcbf_robots.body_fit import Fit
@@ -19,7 +21,7 @@ from ppcbf_robots.body_geometry import UnknownShapeError, digest, pieces_of
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, BodySphere, Spec
 
-VERSION = 1  # of the algorithm: another one finds nothing in the cache
+VERSION = 2  # of the algorithm: another one finds nothing in the cache
 MASSLESS = 1e-6  # [kg], links below which are no bodies but steps between joints
 STILL = 1e-3  # [m/rad | -], what moves less per unit of every joint stands still
 SNAP = 0.015  # [m], how far a centre is moved onto the axis about which it turns
@@ -31,8 +33,8 @@ class LinkCover(Spec):
     """The spheres of one link and what is fixed to it."""
 
     link: str
-    moving: list[BodySphere]
-    still: list[BodySphere]  # no joint moves these
+    spheres: list[BodySphere]
+    left_out: list[BodySphere]  # of a moving link: no joint moves these
     largest: float  # [m], overestimate: farthest point of the spheres' outside from the geometry
     mean: float  # [m], over the outside's area
     area: float  # [m²], of the outside
@@ -84,38 +86,62 @@ def derive_body(robot: RobotModel) -> Body:
     return Body(spheres=[*covered.spheres, *along], links=covered.links)
 
 
+def derive_fixed(robot: RobotModel) -> Body:
+    """Spheres whose union contains the surface of every link that no joint moves: base, torso, a locked arm."""
+    shapes = _by(robot, pin.GeometryType.COLLISION, "parentFrame", fixed=True)
+    frames = {frame: robot.model.frames[frame] for frame in shapes}
+    facts = [[frames[f].name, frames[f].placement.homogeneous.tolist(), digest(x)] for f, x in shapes.items()]
+    return _recalled(facts, lambda: [_fixed_cover(frames[f], x) for f, x in shapes.items()])
+
+
+def _fixed_cover(frame: pin.Frame, objects: Sequence[pin.GeometryObject]) -> LinkCover:
+    fit = body_fit.fit(body_fit.Surface(pieces_of(objects, frame.placement)))
+    return _link_cover(frame.name, fit, np.ones(len(fit.balls.radii), dtype=bool))
+
+
 def _fitted(robot: RobotModel, shapes: dict[int, list[pin.GeometryObject]]) -> Body:
     """The cover of all shapes, from the cache if it is there."""
-    key = _key(robot, shapes)
+    facts = [
+        [_link(robot, j).name, _link(robot, j).placement.homogeneous.tolist(), digest(objects),
+         [np.round(x, 9).tolist() for x in _motion(robot, j)]]
+        for j, objects in shapes.items()
+    ]  # fmt: skip
+    return _recalled(facts, lambda: [_cover(robot, joint, objects) for joint, objects in shapes.items()])
+
+
+def _recalled(facts: list[Any], covers: Callable[[], list[LinkCover]]) -> Body:
+    """The body of the links' covers, from the cache if all that they depend on, with ``facts``, is as it was."""
+    settings = {"version": [VERSION, SNAP, STILL, body_fit.settings()], "links": facts}
+    key = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
     body = body_cache.recall(key, Body)
     if body is None:
-        body = _body([_cover(robot, joint, objects) for joint, objects in shapes.items()])
+        links = covers()
+        spheres = [s for link in links for s in link.spheres] or [s for link in links for s in link.left_out]
+        body = Body(spheres=spheres, links=links)
         body_cache.keep(key, body)
     return body
-
-
-def _body(links: Sequence[LinkCover]) -> Body:
-    moving = [s for link in links for s in link.moving]
-    return Body(spheres=moving or [s for link in links for s in link.still], links=list(links))
 
 
 def _shapes(robot: RobotModel) -> dict[int, list[pin.GeometryObject]]:
     """Geometry to cover by moving joint, in the order of the joints."""
     joints = range(1, robot.model.njoints)
-    found = _readable(robot, pin.GeometryType.COLLISION)
+    found = _by(robot, pin.GeometryType.COLLISION, "parentJoint")
     bare = [joint for joint in joints if joint not in found]
-    visual = _readable(robot, pin.GeometryType.VISUAL) if bare else {}
+    visual = _by(robot, pin.GeometryType.VISUAL, "parentJoint") if bare else {}
     lent = [joint for joint in bare if joint in visual]
     if lent:
         names = ", ".join(f"'{_link(robot, joint).name}'" for joint in lent)
         robot.warnings.append(f"no collision geometry at link {names}: the body spheres cover the visual geometry")
-    return {joint: shapes[joint] for joint in joints for shapes in (found | visual,) if joint in shapes}
+    shapes = visual | found  # collision geometry where there is any
+    return {joint: shapes[joint] for joint in joints if joint in shapes}
 
 
-def _readable(robot: RobotModel, kind: pin.GeometryType) -> dict[int, list[pin.GeometryObject]]:
-    """Shapes of one kind by joint; none, and a warning, if a mesh is missing or a shape cannot be covered."""
+def _by(
+    robot: RobotModel, kind: pin.GeometryType, parent: Literal["parentJoint", "parentFrame"], fixed: bool = False
+) -> dict[int, list[pin.GeometryObject]]:
+    """Readable shapes of the moving or the fixed links, by joint or frame; none, and a warning, if any is not."""
     try:
-        objects = list(robot.geometry(kind).geometryObjects)
+        objects = [o for o in robot.geometry(kind).geometryObjects if (o.parentJoint == 0) == fixed]
         digest(objects)
     except (ValueError, RuntimeError, UnknownShapeError) as error:
         what = " ".join(str(error).split())
@@ -123,41 +149,30 @@ def _readable(robot: RobotModel, kind: pin.GeometryType) -> dict[int, list[pin.G
         return {}
     found: dict[int, list[pin.GeometryObject]] = {}
     for o in objects:
-        found.setdefault(int(o.parentJoint), []).append(o)
+        found.setdefault(int(getattr(o, parent)), []).append(o)
     return found
-
-
-def _key(robot: RobotModel, shapes: dict[int, list[pin.GeometryObject]]) -> str:
-    """SHA-256 over everything the cover depends on."""
-    facts = {
-        "version": [VERSION, SNAP, STILL, body_fit.settings()],
-        "links": [
-            [_link(robot, j).name, _link(robot, j).placement.homogeneous.tolist(), digest(objects),
-             [np.round(x, 9).tolist() for x in _motion(robot, j)]]
-            for j, objects in shapes.items()
-        ],
-    }  # fmt: skip
-    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
 def _cover(robot: RobotModel, joint: int, objects: Sequence[pin.GeometryObject]) -> LinkCover:
     link, (slope, offset) = _link(robot, joint), _motion(robot, joint)
     surface = body_fit.Surface(pieces_of(objects, link.placement))
     fit = _snapped(surface, body_fit.fit(surface), slope, offset)
-    moves = np.abs(slope @ fit.balls.centers.T + offset[:, None]).max(axis=0) > STILL
+    return _link_cover(link.name, fit, np.abs(slope @ fit.balls.centers.T + offset[:, None]).max(axis=0) > STILL)
+
+
+def _link_cover(link: str, fit: Fit, kept: NDArray[np.bool_]) -> LinkCover:
     order = np.argsort(np.linalg.norm(fit.balls.centers, axis=1), kind="stable")  # the end effector comes last
     spheres = [
-        BodySphere(frame=link.name, center=[round(float(x), 4) for x in c], radius=round(float(r), 4))
+        BodySphere(frame=link, center=[round(float(x), 4) for x in c], radius=round(float(r), 4))
         for c, r in zip(fit.balls.centers[order], fit.balls.radii[order], strict=True)
     ]
-    o, moves = fit.overestimate, moves[order]
     return LinkCover(
-        link=link.name,
-        moving=[s for s, m in zip(spheres, moves, strict=True) if m],
-        still=[s for s, m in zip(spheres, moves, strict=True) if not m],
-        largest=o.largest,
-        mean=o.mean,
-        area=o.area,
+        link=link,
+        spheres=[s for s, k in zip(spheres, kept[order], strict=True) if k],
+        left_out=[s for s, k in zip(spheres, kept[order], strict=True) if not k],
+        largest=fit.overestimate.largest,
+        mean=fit.overestimate.mean,
+        area=fit.overestimate.area,
     )
 
 

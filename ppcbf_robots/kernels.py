@@ -28,11 +28,12 @@ SPHERE, HALF_SPACE, BOX, CAPSULE, CYLINDER, MESH = range(6)
 FAST_MATH = {"reassoc", "contract"}  # lets sums be vectorised; NaN and infinity keep their meaning
 _TINY = 1e-9  # [m], below which the direction away from a centre is not defined
 _NEGLIGIBLE = -40.0  # exponent of a plane's weight below which it does not count
+THREADS = int(numba.config.NUMBA_NUM_THREADS)  # for work on many states: the cores, if the environment says no other
 
 
 def kernel(function: F) -> F:
-    """Compile with numba; the machine code is cached beside the source, or in the user's cache folder."""
-    return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=FAST_MATH)(function))
+    """Compile with numba, to run beside other threads; cached beside the source, or in the user's cache folder."""
+    return cast(F, numba.njit(cache=True, error_model="numpy", fastmath=FAST_MATH, nogil=True)(function))
 
 
 def inlined(function: F) -> F:
@@ -41,7 +42,7 @@ def inlined(function: F) -> F:
 
 
 def exact_kernel(function: F) -> F:
-    """The same with IEEE arithmetic as written, for bounds that count rounding errors; runs beside other threads."""
+    """The same with IEEE arithmetic as written, for bounds that count rounding errors."""
     return cast(F, numba.njit(cache=True, error_model="numpy", nogil=True)(function))
 
 
@@ -245,11 +246,14 @@ def _obstacle_row(
 
 @kernel
 def _pair_rows(
-    p: Any, vel: Any, acc: Any, radii: Any, kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any,
+    p: Any, vel: Any, acc: Any, radii: Any, P: int, kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any,
     frames: Any, motions: Any, moving: Any, self_pairs: Any, h: Any, drift: Any, curvature: Any, n: Any,
 ) -> None:  # fmt: skip
-    """All rows of pairs at one state, and in n (pairs, 3) the direction of each, in the base frame."""
-    P, O = len(p), len(kinds)
+    """All rows of pairs at one state, and in n (pairs, 3) the direction of each, in the base frame.
+
+    The first P points keep off the obstacles; the others, fixed to the base, are met by self-collision pairs alone.
+    """
+    O = len(kinds)
     for o in range(O):
         kind, size, frame, motion, moves = kinds[o], sizes[o], frames[o], motions[o], moving[o]
         first, end = plane_start[o], plane_start[o + 1]
@@ -280,9 +284,9 @@ def _pair_rows(
 
 
 @kernel
-def _gradient(row: int, n: Any, Jp: Any, O: int, self_pairs: Any, out: Any) -> None:
+def _gradient(row: int, n: Any, Jp: Any, P: int, O: int, self_pairs: Any, out: Any) -> None:
     """∇h (nv,) of a pair's row."""
-    pairs, nv = len(Jp) * O, len(out)
+    pairs, nv = P * O, len(out)
     if row < pairs:
         i = row // O
         for j in range(nv):
@@ -296,9 +300,9 @@ def _gradient(row: int, n: Any, Jp: Any, O: int, self_pairs: Any, out: Any) -> N
 
 
 @kernel
-def _closing(row: int, n: Any, vel: Any, O: int, self_pairs: Any) -> float:
+def _closing(row: int, n: Any, vel: Any, P: int, O: int, self_pairs: Any) -> float:
     """ḣ of a pair's row where obstacles rest."""
-    pairs, hdot = len(vel) * O, 0.0
+    pairs, hdot = P * O, 0.0
     if row < pairs:
         for r in range(3):
             hdot += n[row, r] * vel[row // O, r]
@@ -312,27 +316,28 @@ def _closing(row: int, n: Any, vel: Any, O: int, self_pairs: Any) -> float:
 @kernel
 def rows_at(
     placements: Any, J: Any, dJ: Any, v: Any, angles: Any, h: Any, grad: Any, drift: Any, curvature: Any,
-    joints: Any, offsets: Any, mask: Any, radii: Any,
+    joints: Any, offsets: Any, mask: Any, radii: Any, P: int,
     kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any, frames: Any, motions: Any,
     self_pairs: Any, limit_joint: Any, limit_sign: Any, limit_bound: Any,
 ) -> None:  # fmt: skip
     """All rows at a batch of states: body points by obstacles (obstacle fastest), self-collision pairs, joint limits.
 
     Inputs of one state as in :func:`point_kinematics` with a leading batch axis; outputs h, drift, curvature (B, rows)
-    and grad (B, rows, nv). Then follow the body's points and radii, obstacles as packed by
-    :class:`ppcbf_robots.shapes.Packed`, self-collision pairs (:, 2) and joint limits.
+    and grad (B, rows, nv). Then follow the points of the body and of what is fixed to the base, all radii, the number P
+    of the body's, obstacles as packed by :class:`ppcbf_robots.shapes.Packed`, self-collision pairs (:, 2) of any of the
+    points, and joint limits.
     """
-    P, O, nv = len(joints), len(kinds), v.shape[1]
-    p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
+    points, O, nv = len(joints), len(kinds), v.shape[1]
+    p, vel, acc = np.empty((points, 3)), np.empty((points, 3)), np.empty((points, 3))
     pairs = P * O + len(self_pairs)
-    Jp, n = np.empty((P, 3, nv)), np.empty((pairs, 3))
+    Jp, n = np.empty((points, 3, nv)), np.empty((pairs, 3))
     moving = np.array([np.any(motions[o] != 0.0) for o in range(O)])
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
-        _pair_rows(p, vel, acc, radii, kinds, sizes, margins, planes, plane_start, frames, motions, moving, self_pairs,
-                   h[s], drift[s], curvature[s], n)  # fmt: skip
+        _pair_rows(p, vel, acc, radii, P, kinds, sizes, margins, planes, plane_start, frames, motions, moving,
+                   self_pairs, h[s], drift[s], curvature[s], n)  # fmt: skip
         for row in range(pairs):
-            _gradient(row, n, Jp, O, self_pairs, grad[s, row])
+            _gradient(row, n, Jp, P, O, self_pairs, grad[s, row])
         for k in range(len(limit_joint)):
             row, j = pairs + k, limit_joint[k]
             h[s, row] = limit_sign[k] * (angles[s, j] - limit_bound[k])
@@ -345,7 +350,7 @@ def rows_at(
 def nearest_rows_at(
     placements: Any, J: Any, dJ: Any, v: Any, angles: Any, gamma: float, share: Any,
     least: Any, least_rho: Any, h: Any, grad: Any, curvature: Any,
-    joints: Any, offsets: Any, mask: Any, radii: Any,
+    joints: Any, offsets: Any, mask: Any, radii: Any, P: int,
     kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any, frames: Any, motions: Any,
     self_pairs: Any, limit_joint: Any, limit_sign: Any, limit_bound: Any,
 ) -> None:  # fmt: skip
@@ -354,16 +359,16 @@ def nearest_rows_at(
     share (B,) is that of v at which ``rho = ḣ + gamma h`` is asked for. Outputs: least h and least rho (B,) of all
     rows; h, curvature (B, N) and grad (B, N, nv) of the nearest N.
     """
-    P, O, nv, count = len(joints), len(kinds), v.shape[1], h.shape[1]
-    p, vel, acc = np.empty((P, 3)), np.empty((P, 3)), np.empty((P, 3))
+    points, O, nv, count = len(joints), len(kinds), v.shape[1], h.shape[1]
+    p, vel, acc = np.empty((points, 3)), np.empty((points, 3)), np.empty((points, 3))
     pairs, rows = P * O + len(self_pairs), P * O + len(self_pairs) + len(limit_joint)
-    Jp, n = np.empty((P, 3, nv)), np.empty((pairs, 3))
+    Jp, n = np.empty((points, 3, nv)), np.empty((pairs, 3))
     all_h, drift, second, key = np.empty(rows), np.empty(rows), np.empty(rows), np.empty(rows)
     still = np.zeros(O, dtype=np.bool_)
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
-        _pair_rows(p, vel, acc, radii, kinds, sizes, margins, planes, plane_start, frames, motions, still, self_pairs,
-                   all_h, drift, second, n)  # fmt: skip
+        _pair_rows(p, vel, acc, radii, P, kinds, sizes, margins, planes, plane_start, frames, motions, still,
+                   self_pairs, all_h, drift, second, n)  # fmt: skip
         least[s] = least_rho[s] = np.inf
         for row in range(rows):
             if row >= pairs:
@@ -371,7 +376,7 @@ def nearest_rows_at(
                 all_h[row], second[row] = limit_sign[k] * (angles[s, limit_joint[k]] - limit_bound[k]), 0.0
                 hdot = limit_sign[k] * v[s, limit_joint[k]]
             else:
-                hdot = _closing(row, n, vel, O, self_pairs)
+                hdot = _closing(row, n, vel, P, O, self_pairs)
             least[s] = min(least[s], all_h[row])
             least_rho[s] = min(least_rho[s], share[s] * hdot + gamma * all_h[row])
             key[row] = gamma * all_h[row] + min(hdot, 0.0)
@@ -380,7 +385,7 @@ def nearest_rows_at(
             key[row] = np.inf
             h[s, at], curvature[s, at] = all_h[row], second[row]
             if row < pairs:
-                _gradient(row, n, Jp, O, self_pairs, grad[s, at])
+                _gradient(row, n, Jp, P, O, self_pairs, grad[s, at])
             else:
                 grad[s, at, :] = 0.0
                 grad[s, at, limit_joint[row - pairs]] = limit_sign[row - pairs]

@@ -15,7 +15,7 @@ from ppcbf_robots.barriers import Barrier, BarrierKind, EnergyBarrier, RhoBarrie
 from ppcbf_robots.body import body_spheres
 from ppcbf_robots.controllers import NominalController
 from ppcbf_robots.derive import SAMPLE_SEED, Domain, derive_domain, derive_gains
-from ppcbf_robots.derive_body import Body, derive_body
+from ppcbf_robots.derive_body import Body, derive_body, derive_fixed
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.resources import default_package_dirs, find_example, find_robot, find_world, is_file
@@ -44,7 +44,8 @@ class Robot:
     start: Array  # (nq,)
     start_velocity: Array  # (nv,)
     derived: list[str]  # what was not in the spec and was derived
-    self_pairs: list[tuple[int, int]]  # body spheres that must not touch each other
+    self_pairs: list[tuple[int, int]]  # spheres that must not touch each other; those of `fixed` follow the body's
+    fixed: Body  # what no joint moves, if self-collision is asked for
     cover: Body | None = None  # how the body was fitted, if it was
 
     @property
@@ -55,7 +56,7 @@ class Robot:
     def safety(self, obstacles: Sequence[Obstacle]) -> SafetyFunction:
         """Its safety function among obstacles, with the bounds of X as rows if the spec guards them."""
         q, v = (self.domain.q, GUARDED * self.domain.v) if self.spec.domain.guard else (None, None)
-        return SafetyFunction(self.model, self.body, obstacles, True, q, v, self.self_pairs)
+        return SafetyFunction(self.model, self.body, obstacles, True, q, v, self.self_pairs, self.fixed.spheres)
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,7 @@ class Problem:
             "payload": None if self.robot.spec.payload is None else self.robot.spec.payload.model_dump(),
             "body": [s.model_dump() for s in self.robot.body],
             **({"self_pairs": self.robot.self_pairs} if self.robot.self_pairs else {}),
+            **({"fixed": [s.model_dump() for s in self.robot.fixed.spheres]} if self.robot.fixed.spheres else {}),
         }
         gains, domain = self.robot.controller.gains, self.robot.domain
         task = {
@@ -159,11 +161,12 @@ def load_robot(name: str) -> Robot:
     controller = NominalController(model, gains, model.from_angles(goal))
     start_velocity = vector(velocity, model.nv, f"{path}: start_velocity")
     cover = cover if cover and cover.links else None
-    pairs, q_start = [], model.from_angles(start)
+    pairs, fixed, q_start = [], Body(spheres=[], links=[]), model.from_angles(start)
     if spec.self_collision is not None:
-        srdf = spec.self_collision.srdf
-        pairs = self_pairs(model, body, q_start, None if srdf is None else path.parent / srdf, fitted=spec.body is None)
-    return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, cover)
+        fixed, srdf = derive_fixed(model), spec.self_collision.srdf
+        file = None if srdf is None else path.parent / srdf
+        pairs = self_pairs(model, body, fixed.spheres, q_start, file, fitted=spec.body is None)
+    return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, fixed, cover)
 
 
 def load_problem(robot: str, world: str) -> Problem:

@@ -62,7 +62,8 @@ class SafetyFunction:
         joint_limits: whether finite joint limits are rows too (Remark 1 of the paper).
         domain: position ranges (nv, 2) that count as joint limits where they are tighter than the robot's.
         v_domain: velocity ranges (nv, 2) that a filter keeps; None keeps none.
-        self_pairs: indices (S, 2) of body spheres that must not touch each other.
+        self_pairs: indices (S, 2) of spheres that must not touch each other; those of ``fixed`` follow the body's.
+        fixed: spheres of what no joint moves.
 
     Raises:
         InputError: if an obstacle contains the base, or no body sphere is given.
@@ -77,6 +78,7 @@ class SafetyFunction:
         domain: Array | None = None,
         v_domain: Array | None = None,
         self_pairs: Sequence[tuple[int, int]] = (),
+        fixed: Sequence[BodySphere] = (),
     ) -> None:
         if not body:
             raise InputError("the robot has no body spheres; give `body` in the robot spec")
@@ -85,15 +87,17 @@ class SafetyFunction:
         for i, o in enumerate(self.obstacles):
             if self.packed.distance(i, np.zeros(3)) < 0.0:
                 raise InputError(f"obstacle '{o.name}' contains the robot's base (the origin); move or shrink it")
+        everything = [*body, *fixed]
         self.points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
-        self._radii = np.array([s.radius for s in body])
+        self._all_points = robot.points([s.frame for s in everything], np.array([s.center for s in everything]))
+        self._radii = np.array([s.radius for s in everything])
         self._self_pairs = np.array(self_pairs, dtype=np.int64).reshape(-1, 2)
         self.limits = self._limit_rows(joint_limits, domain)
         self._limit_joint = np.array([i for i, _, _ in self.limits], dtype=np.int64)
         self._limit_sign = np.array([s for _, s, _ in self.limits])
         self._limit_bound = np.array([b for _, _, b in self.limits])
-        labels = [f"{s.frame}#{i}" for i, s in enumerate(body)]
-        self.names = [f"{b} / {o.name}" for b in labels for o in self.obstacles]
+        labels = [f"{s.frame}#{i}" for i, s in enumerate(everything)]
+        self.names = [f"{b} / {o.name}" for b in labels[: len(body)] for o in self.obstacles]
         self.names += [f"{labels[a]} / {labels[b]}" for a, b in self._self_pairs]
         self.pairs = len(self.names)
         self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in self.limits]
@@ -159,9 +163,9 @@ class SafetyFunction:
 
     def _scene(self, o: Packed) -> tuple[Any, ...]:
         """Body, obstacles, pairs and limits as the kernels take them."""
-        points = self.points
+        points = self._all_points
         return (
-            points.joints, points.offsets, points.mask, self._radii,
+            points.joints, points.offsets, points.mask, self._radii, len(self.body),
             o.kinds, o.sizes, o.margins, o.planes, o.plane_start, o.frames, o.motions,
             self._self_pairs, self._limit_joint, self._limit_sign, self._limit_bound,
         )  # fmt: skip

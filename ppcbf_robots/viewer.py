@@ -215,13 +215,13 @@ def _draw_obstacle(node: meshcat.Visualizer, obstacle: Obstacle, view: _View) ->
 
 
 def _draw_robot(node: meshcat.Visualizer, problem: Problem, run: _Run, view: _View) -> None:
-    """Shapes and body spheres, under one animated node per joint each."""
+    """Shapes and the spheres of the body and of what is fixed, under one animated node per joint each."""
     joint, offset = _tip(problem)
     for i, part in enumerate(robot_parts(problem.model, joint, offset[:3])):
         child = node["robot"][str(part.joint)][str(i)]
         child.set_object(part.shape, _material(run.color, 0.45 if run.ghost else 1.0))
         child.set_transform(part.placement)
-    body = problem.robot.body
+    body = [*problem.robot.body, *problem.robot.fixed.spheres]
     points = problem.model.points([s.frame for s in body], np.array([s.center for s in body]))
     for i, (parent, center, sphere) in enumerate(zip(points.joints, points.offsets, body, strict=True)):
         child = node["body spheres"][str(parent)][str(i)]

@@ -22,6 +22,18 @@ from ppcbf_robots.specs import Array, BodyPrimitive, BodySphere
 
 PANDA = "urdf: panda\nlocked: {panda_finger_joint1: 0.02, panda_finger_joint2: 0.02}\n"
 ARMS = ["panda", "panda_collision", "ur5", "kinova", "talos_left_arm"]
+OTHERS = [
+    "ur3",
+    "ur10",
+    "z1",
+    "xarm7",
+    "so100",
+    "so101",
+    "double_pendulum",
+    "asr_twodof",
+    "tiago_no_hand",
+    "baxter_left",
+]
 FEW = settings(max_examples=8, phases=[Phase.explicit, Phase.generate])  # a fit takes a second: no shrinking
 SIZE = st.floats(0.01, 0.4)
 
@@ -129,17 +141,22 @@ def links(robot: Robot) -> dict[int, derive_body.LinkCover]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", [*ARMS, *OTHERS])
 def test_every_moving_link_is_contained(name, arm):
     robot = arm(name)
-    covers, checked = links(robot), set()
-    for o in robot.model.geometry(pin.GeometryType.COLLISION).geometryObjects:
-        if o.parentJoint:
-            cover = covers[int(o.parentJoint)]
-            assert_contains(o.geometry, o.placement, *balls_in_joint(robot, cover.moving + cover.still))
-            checked.add(int(o.parentJoint))
+    covers = links(robot)
+    shapes, visual = (
+        [o for o in robot.model.geometry(kind).geometryObjects if o.parentJoint]
+        for kind in (pin.GeometryType.COLLISION, pin.GeometryType.VISUAL)
+    )
+    collides = {int(o.parentJoint) for o in shapes}
+    shapes += [o for o in visual if int(o.parentJoint) not in collides]
+    for o in shapes:
+        cover = covers[int(o.parentJoint)]
+        assert_contains(o.geometry, o.placement, *balls_in_joint(robot, cover.spheres + cover.left_out))
+    checked = {int(o.parentJoint) for o in shapes}
     assert checked == set(range(1, robot.model.model.njoints))
-    assert robot.body == [s for cover in covers.values() for s in cover.moving]
+    assert robot.body == [s for cover in covers.values() for s in cover.spheres]
     assert "body" in robot.derived
 
 
@@ -158,7 +175,7 @@ def test_overestimate_against_coal(name, arm):
     robot, rng = arm(name), np.random.default_rng(0)
     shapes = robot.model.geometry(pin.GeometryType.COLLISION).geometryObjects
     for joint, cover in links(robot).items():
-        centers, radii = balls_in_joint(robot, cover.moving + cover.still)
+        centers, radii = balls_in_joint(robot, cover.spheres + cover.left_out)
         pick = rng.choice(len(radii), 400, p=radii**2 / (radii**2).sum())
         way = rng.normal(size=(400, 3))
         points = centers[pick] + radii[pick, None] * way / np.linalg.norm(way, axis=1)[:, None]
@@ -303,15 +320,15 @@ def test_a_first_link_on_its_axis_is_left_out_and_what_reaches_out_is_not(tmp_pa
     on_axis = '<origin xyz="0 0 0.15"/><geometry><cylinder radius="0.05" length="0.3"/></geometry>'
     robot = load_robot(urdf(tmp_path, on_axis, box(0.1, 0.1, 0.1)))
     upper, fore = links(robot).values()
-    assert upper.still and not upper.moving and fore.moving
+    assert upper.left_out and not upper.spheres and fore.spheres
     assert {s.frame for s in robot.body} == {"fore"}
     arm_out = load_robot(urdf(tmp_path, f"{box(0.5, 0.08, 0.1, '0.2 0 0.1')}", box(0.1, 0.1, 0.1)))
     upper = links(arm_out)[1]
-    centers, radii = balls_in_joint(arm_out, upper.moving)
+    centers, radii = balls_in_joint(arm_out, upper.spheres)
     assert gap(np.array([[0.45, 0.04, 0.15], [0.45, -0.04, 0.05]]), centers, radii) <= 1e-9
-    for s in upper.still:
+    for s in upper.left_out:
         assert np.linalg.norm(s.center[:2]) < 1.1e-3
-    for s in upper.moving:
+    for s in upper.spheres:
         assert np.linalg.norm(s.center[:2]) > 1e-3
 
 
@@ -330,7 +347,7 @@ def test_visual_geometry_is_covered_where_there_is_no_other(tmp_path):
     assert robot.model.warnings == [
         "no collision geometry at link 'upper', 'fore': the body spheres cover the visual geometry"
     ]
-    centers, radii = balls_in_joint(robot, links(robot)[2].moving)
+    centers, radii = balls_in_joint(robot, links(robot)[2].spheres)
     assert gap(np.array([[0.05, 0.025, 0.3], [-0.05, -0.025, 0.0]]), centers, radii) <= 1e-9
 
 

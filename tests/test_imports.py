@@ -25,7 +25,7 @@ LAYERS = [
     ["robot", "world_files"],
     ["safety", "controllers", "network", "engines", "plant", "pushes", "batch_dynamics"],
     ["condense", "ending"],
-    ["barriers", "derive", "derive_body", "qp", "self_collision"],
+    ["barriers", "derive", "derive_body", "holdable", "qp", "self_collision"],
     ["cutting_planes", "filters", "state_check", "slip"],
     ["closed_form", "qp_filter", "sent_torques", "status_log"],
     ["safety_filter", "problem"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from ray_helpers import DOUBLE, draw, make_field, make_rays, tensors
 
 from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.errors import InputError
+from ppcbf_robots.learning import threads
+from ppcbf_robots.learning.linear_program import best_worst_row
 from ppcbf_robots.learning.presets import DEFAULT
 from ppcbf_robots.learning.rays import FAR, Rays, build_pool, rays_at
 from ppcbf_robots.learning.train import Trainer
@@ -118,6 +121,25 @@ def test_the_pool_is_as_large_as_asked_for(two_link):
     rays, volume = build_pool(two_link, 3000, 6, 0.5, np.random.default_rng(0))
     count = sum(len(r["q"]) for r in rays)
     assert 3000 <= count == sum(len(states["q"]) for states in volume)
+
+
+def test_threads_change_nothing(panda, monkeypatch):
+    """Rays and linear programs in one piece and in three, to the last bit; the pieces are worked on at once."""
+    rng, count, working = np.random.default_rng(0), 3 * threads.LEAST + 7, set()
+    q = panda.model.from_angles(panda.robot.domain.sample_q(rng, count))
+    v, goals = panda.robot.domain.sample_v(rng, count), panda.robot.domain.sample_q(rng, count)
+    offset, c = rng.normal(size=(count, 5)), rng.normal(size=(count, 5, 7))
+    program = [torch.as_tensor(x) for x in (offset, c, 0.1 * rng.normal(size=(count, 7)), rng.uniform(size=count))]
+    found = []
+    for number in (1, 3):
+        monkeypatch.setattr(threads, "THREADS", number)
+        rays = [rays_at(panda, q, v, 6, g) for g in (None, goals)]
+        found.append([*(x for r in rays for x in (*r[0].values(), *r[1:])), *best_worst_row(*program)])
+    for one, three in zip(*found, strict=True):
+        assert np.array_equal(np.asarray(one), np.asarray(three))
+    barrier = threading.Barrier(3, timeout=20.0)
+    parts = threads.in_threads(count, lambda part: (barrier.wait(), working.add(threading.get_ident()), part)[2])
+    assert len(working) == 3 and [i for part in parts for i in range(*part.indices(count))] == list(range(count))
 
 
 def test_a_domain_in_collision_is_refused(tmp_path, monkeypatch):

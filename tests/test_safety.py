@@ -346,19 +346,69 @@ def test_self_collision_on_request(tmp_path):
     (tmp_path / "some.yaml").write_text(text + "self_collision: {srdf: arm.srdf}\n")
     (tmp_path / "none.yaml").write_text(text + "self_collision: {srdf: missing.srdf}\n")
     everything, some = (load_problem(str(tmp_path / f"{name}.yaml"), "sphere") for name in ("all", "some"))
-    links = [{everything.robot.body[i].frame for i in pair} for pair in everything.robot.self_pairs]
+    spheres = [*everything.robot.body, *everything.robot.fixed.spheres]
+    links = [{spheres[i].frame for i in pair} for pair in everything.robot.self_pairs]
     assert {"panda_link7", "panda_link3"} in links and {"panda_link3", "panda_link4"} not in links
-    kept = [{some.robot.body[i].frame for i in pair} for pair in some.robot.self_pairs]
+    kept = [{spheres[i].frame for i in pair} for pair in some.robot.self_pairs]
     assert {"panda_link7", "panda_link3"} not in kept and 0 < len(kept) < len(links)
     q = everything.robot.start
     p = everything.safety.points.kinematics(everything.model.evaluate(q, np.zeros(7))).p
     rows = everything.safety.evaluate(everything.model.evaluate(q, np.zeros(7)))
-    i, j = everything.robot.self_pairs[-1]
+    i, j = max(pair for pair in everything.robot.self_pairs if pair[1] < len(p))
     gap = np.linalg.norm(p[i] - p[j]) - everything.robot.body[i].radius - everything.robot.body[j].radius
-    assert rows.h[everything.safety.pairs - 1] == pytest.approx(gap)
+    row = everything.safety.pairs - len(everything.robot.self_pairs) + everything.robot.self_pairs.index((i, j))
+    assert rows.h[row] == pytest.approx(gap)
     assert everything.fingerprint()["robot"] != some.fingerprint()["robot"]
     with pytest.raises(InputError, match="SRDF not found"):
         load_problem(str(tmp_path / "none.yaml"), "sphere")
+
+
+def test_the_base_is_kept_off_too(tmp_path):
+    """Spheres of the links that no joint moves: contained like the body, met by what reaches them, no obstacle row."""
+    spec = "urdf: ur5\nself_collision: {}\n"
+    (tmp_path / "arm.yaml").write_text(spec)
+    problem, plain = load_problem(str(tmp_path / "arm.yaml"), "pillar"), load_problem("ur5", "pillar")
+    body, fixed = problem.robot.body, problem.robot.fixed.spheres
+    assert fixed and {s.frame for s in fixed} == {"base_link"}
+    every = [*body, *fixed]
+    met = [(every[i].frame, every[j].frame) for i, j in problem.robot.self_pairs if j >= len(body)]
+    assert ("wrist_3_link", "base_link") in met and ("shoulder_link", "base_link") not in met
+    # the arm folded down onto its own base: h of a pair is the distance of the spheres in the world
+    q = np.array([0.0, 0.9, 2.2, 0.0, 0.0, 0.0])
+    dyn = problem.model.evaluate(q, np.array([0.3, -0.5, 0.7, 0.2, -0.4, 0.6]))
+    rows = problem.safety.evaluate(dyn)
+    assert len(rows.h) == len(plain.safety.evaluate(dyn).h) + len(problem.robot.self_pairs)
+    points = problem.model.points([s.frame for s in every], np.array([s.center for s in every])).kinematics(dyn)
+    first = problem.safety.pairs - len(problem.robot.self_pairs)
+    np.testing.assert_allclose(rows.h[:first], plain.safety.evaluate(dyn).h[:first])
+    for k, (i, j) in enumerate(problem.robot.self_pairs, start=first):
+        gap = np.linalg.norm(points.p[i] - points.p[j]) - every[i].radius - every[j].radius
+        assert rows.h[k] == pytest.approx(gap)
+        assert problem.safety.names[k].startswith(f"{every[i].frame}#{i} / {every[j].frame}#{j}")
+    step = 1e-6
+    h = [problem.safety.evaluate(problem.model.evaluate(q + s * dyn.v, dyn.v)).h for s in (-step, step)]
+    np.testing.assert_allclose((h[1] - h[0]) / (2 * step), rows.hdot(dyn.v), atol=1e-6)
+    near = problem.safety.nearest(problem.model.evaluate_batch(q[None], dyn.v[None]), 5.0, np.ones(1), 8)
+    order = np.argsort(5.0 * rows.h + np.minimum(rows.hdot(dyn.v), 0.0))[:8]
+    np.testing.assert_allclose(near.h[0], rows.h[order])
+    np.testing.assert_allclose(near.grad[0], rows.grad[order], atol=1e-12)
+    assert plain.fingerprint()["robot"] != problem.fingerprint()["robot"]
+
+
+POST = """<link name="post"><collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+<joint name="foot" type="fixed"><parent link="base"/><child link="post"/><origin xyz="{x} 0 0"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(("x", "pairs"), [(5.0, 0), (0.8, 1)])
+def test_fixed_spheres_out_of_reach_make_no_pairs(tmp_path, x, pairs):
+    """A post that stands 5 m away is no business of the arm; one that it reaches is."""
+    text = (files("ppcbf_robots.robots") / "two_link.urdf").read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", POST.format(x=x)))
+    body = "body: [{frame: fore, center: [0.35, 0, 0], radius: 0.05}]"
+    (tmp_path / "arm.yaml").write_text(f"urdf: arm.urdf\n{body}\nstart: [1.5, 0]\nself_collision: {{}}\n")
+    robot = load_problem(str(tmp_path / "arm.yaml"), "circle").robot
+    assert any(s.frame == "post" for s in robot.fixed.spheres)
+    assert len(robot.self_pairs) == pairs
 
 
 def test_an_srdf_and_fitted_spheres_that_cover_several_links(tmp_path):

@@ -18,6 +18,7 @@ import torch
 
 from ppcbf_robots.learning import simplex_kernel
 from ppcbf_robots.learning.simplex_kernel import PIVOTS, TIE, TOLERANCE
+from ppcbf_robots.learning.threads import in_threads
 
 
 class Optimum(NamedTuple):
@@ -46,7 +47,8 @@ def best_worst_row(offset: torch.Tensor, c: torch.Tensor, p: torch.Tensor, budge
     if offset.device.type != "cpu":
         return pivot_together(offset, c, p, budget)
     found = Optimum(torch.empty_like(offset[:, 0]), torch.empty_like(offset), torch.empty_like(p))
-    simplex_kernel.solve(*(x.contiguous().numpy() for x in (offset, c, p, budget)), *(x.numpy() for x in found))
+    arrays = [x.contiguous().numpy() for x in (offset, c, p, budget, *found)]
+    in_threads(len(offset), lambda part: simplex_kernel.solve(*(x[part] for x in arrays)))
     return found
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ppcbf_robots.barriers import BarrierRows, rho_rows
+from ppcbf_robots.learning.threads import in_threads
 from ppcbf_robots.network import NetworkKind, Params, energy_weight, value_along, value_and_grad
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.robot import RobotModel
@@ -192,6 +193,17 @@ def rays_at(
     problem: Problem, q: Array, v: Array, rows: int, goal_angles: Array | None = None
 ) -> tuple[RayArrays, Array, Array]:
     """Rays through B states (q, v), the states' least rho (B,), and whether each is free of collision (B,)."""
+    goals = goal_angles
+    parts = in_threads(len(v), lambda i: _rays_at(problem, q[i], v[i], rows, None if goals is None else goals[i]))
+    if len(parts) == 1:
+        return parts[0]
+    rays = {k: np.concatenate([found[0][k] for found in parts]) for k in parts[0][0]}
+    return rays, np.concatenate([found[1] for found in parts]), np.concatenate([found[2] for found in parts])
+
+
+def _rays_at(
+    problem: Problem, q: Array, v: Array, rows: int, goal_angles: Array | None
+) -> tuple[RayArrays, Array, Array]:
     d, share = _to_face(v, problem.robot.domain.v)
     dyn = problem.model.evaluate_batch(q, d)
     near = problem.safety.nearest(dyn, problem.robot.spec.barrier.gamma, share, rows)
