@@ -24,6 +24,8 @@ SMALLEST = 0.020  # [m], but not less than this
 MEAN = 0.016  # [m], what the mean overestimate of a link should stay below,
 MEAN_SHARE = 0.45  # or this share of the largest one aimed at, if that is less
 MAX_BALLS = 8  # per joint
+MORE_BALLS = (12, 20)  # for a link that no joint moves,
+ROOMY = 0.06  # [m], unless its largest overestimate is less
 POINTS = 400  # of the surface, that the search looks at
 TRIALS = 100  # moves tried per ball
 GRID_POINTS = 20_000  # of the grid of distances that the search uses
@@ -137,7 +139,19 @@ def outside(balls: Balls, directions: int) -> tuple[Array, Array]:
 
 def settings() -> list[float]:
     """The numbers above, on which the result depends."""
-    search = [MAX_BALLS, POINTS, TRIALS, GRID_POINTS, HOPELESS, WORTH, DIRECTIONS, FINE_DIRECTIONS, ROUND]
+    search = [
+        MAX_BALLS,
+        *MORE_BALLS,
+        ROOMY,
+        POINTS,
+        TRIALS,
+        GRID_POINTS,
+        HOPELESS,
+        WORTH,
+        DIRECTIONS,
+        FINE_DIRECTIONS,
+        ROUND,
+    ]
     return [LARGEST, THICKNESS_SHARE, SMALLEST, MEAN, MEAN_SHARE, *search, SPACING, SPACING_SHARE, SIDES]
 
 
@@ -153,6 +167,16 @@ def fit(surface: Surface) -> Fit:
             break
     least = min(f.cost for f in tried)
     return next(f for f in tried if f.cost <= WORTH * least)
+
+
+def fit_fixed(surface: Surface) -> Fit:
+    """For what no joint moves, a torso or a table: more balls where it is large, since a few leave too little room."""
+    found = fit(surface)
+    for count in MORE_BALLS:
+        if found.overestimate.largest <= ROOMY:
+            break
+        found = min(found, _fit_count(surface, count, None), key=lambda f: f.cost)
+    return found
 
 
 def _first_count(surface: Surface) -> int:

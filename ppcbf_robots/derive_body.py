@@ -95,7 +95,7 @@ def derive_fixed(robot: RobotModel) -> Body:
 
 
 def _fixed_cover(frame: pin.Frame, objects: Sequence[pin.GeometryObject]) -> LinkCover:
-    fit = body_fit.fit(body_fit.Surface(pieces_of(objects, frame.placement)))
+    fit = body_fit.fit_fixed(body_fit.Surface(pieces_of(objects, frame.placement)))
     return _link_cover(frame.name, fit, np.ones(len(fit.balls.radii), dtype=bool))
 
 

@@ -28,7 +28,7 @@ SPHERE, HALF_SPACE, BOX, CAPSULE, CYLINDER, MESH = range(6)
 FAST_MATH = {"reassoc", "contract"}  # lets sums be vectorised; NaN and infinity keep their meaning
 _TINY = 1e-9  # [m], below which the direction away from a centre is not defined
 _NEGLIGIBLE = -40.0  # exponent of a plane's weight below which it does not count
-THREADS = int(numba.config.NUMBA_NUM_THREADS)  # for work on many states: the cores, if the environment says no other
+THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # the cores, or what the environment says
 
 
 def kernel(function: F) -> F:

@@ -28,6 +28,7 @@ from ppcbf_robots.world_files.load import load_world
 
 CLEAR = 0.05  # [m | rad] of everything, where a start is looked for
 STARTS = 2_000  # configurations among which it is
+POSTURES = 500  # in which spheres of the body are looked at for overlap
 GUARDED = 0.99  # of X's velocities, where the filter's rows hold them: room for what happens within a control period
 
 
@@ -165,7 +166,9 @@ def load_robot(name: str) -> Robot:
     if spec.self_collision is not None:
         fixed, srdf = derive_fixed(model), spec.self_collision.srdf
         file = None if srdf is None else path.parent / srdf
-        pairs = self_pairs(model, body, fixed.spheres, q_start, file, fitted=spec.body is None)
+        random = domain.sample_q(np.random.default_rng(SAMPLE_SEED), POSTURES)
+        postures = np.concatenate([q_start[None], model.from_angles(random)])
+        pairs = self_pairs(model, body, fixed.spheres, postures, file, fitted=spec.body is None)
     return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, fixed, cover)
 
 

@@ -6,12 +6,14 @@ import dataclasses
 import json
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from ppcbf_robots import rollout
 from ppcbf_robots.controllers import Gains, NominalController
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.problem import load_problem
 from ppcbf_robots.rollout import Trajectory, simulate
 from ppcbf_robots.safety_filter import SafetyFilter
 
@@ -212,3 +214,38 @@ def test_panda_passes_a_ball_without_contact_or_energy(panda):
     assert rise(run) < 1e-3
     assert np.all(np.abs(run.u) <= panda.model.u_max)
     assert set(run.status) == {Status.FREE, Status.CORRECTING}
+
+
+def test_an_arm_keeps_off_its_own_base(tmp_path):
+    """A UR5 whose goal lies in its own base: it gets there without a filter, and rests before it with one.
+
+    Distances are those of the collision meshes, by another library than the rows'.
+    """
+    (tmp_path / "arm.yaml").write_text("urdf: ur5\nself_collision: {}\n")
+    problem = load_problem(str(tmp_path / "arm.yaml"), "sphere")
+    model = problem.model
+    shapes = model.geometry(pin.GeometryType.COLLISION)
+    base = [i for i, o in enumerate(shapes.geometryObjects) if o.parentJoint == 0]
+    wrist = [i for i, o in enumerate(shapes.geometryObjects) if o.parentJoint >= 4]
+    for pair in ((i, j) for i in base for j in wrist):
+        shapes.addCollisionPair(pin.CollisionPair(*pair))
+    data = shapes.createData()
+
+    def distance(q):
+        pin.computeDistances(model.model, model.data, shapes, data, q)
+        return min(r.min_distance for r in data.distanceResults)
+
+    start = np.array([0.0, -1.0, 2.0, -1.0, 0.0, 0.0])
+    goal = np.array([0.0, 0.3, 2.7, 0.3, 0.0, 0.0])
+    assert distance(goal) <= 0.0 < 0.2 < distance(start)
+    stiff = Gains("bounded_spring", 0.2 * model.u_max, 0.1 * model.u_max, 0.2 * model.u_max)
+    controller = NominalController(model, stiff, goal)
+    filter_ = SafetyFilter(model, problem.safety, problem.barrier("lb-cbf"))
+    least = []
+    for chosen in (None, filter_):
+        run = simulate(problem.safety, controller, chosen, start, np.zeros(6), 5.0)
+        least.append(min(distance(q) for q in run.q[::20]))
+    assert least[0] <= 0.0 and 0.0 < least[1] < 0.1
+    assert run.h.min() >= 0.0 and np.abs(run.v[-1]).max() < 0.05
+    nearest = problem.safety.names[int(np.argmin(problem.safety.evaluate(model.evaluate(run.q[-1], 0 * start)).h))]
+    assert "base_link" in nearest

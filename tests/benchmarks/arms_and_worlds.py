@@ -2,8 +2,8 @@
 
 The bundled worlds are scaled to each arm's reach and set before its first joint. Start and goal are drawn on opposite
 sides (left and right of the arm's middle plane), clear of everything by 2 cm, with an obstacle on the straight path
-between them. A run takes 15 s, or 60 s where the arm still moves then. One JSON object per case is appended to the output; cases already there are skipped. Without the output file all run again, with the
-barriers that are there.
+between them. A run takes 15 s, or 60 s where the arm still moves then. One JSON object per case is appended to the
+output; cases already there are skipped. Without the output file all run again, with the barriers that are there.
 
 Run: ``python tests/benchmarks/arms_and_worlds.py --out runs/arms.jsonl``, then ``--table`` for the README's table.
 """
