@@ -26,8 +26,8 @@ from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_s
 from ppcbf_robots.world import Obstacle, WorldSpec
 from ppcbf_robots.world_files.load import load_world
 
-CLEAR = 0.05  # [m | rad] of everything, where a start is looked for
-STARTS = 2_000  # configurations among which it is
+CLEAR = 0.05  # [m | rad] of everything, where a start or goal is looked for
+TRIED = 2_000  # configurations among which it is
 POSTURES = 500  # in which spheres of the body are looked at for overlap
 GUARDED = 0.99  # of X's velocities, where the filter's rows hold them: room for what happens within a control period
 
@@ -175,27 +175,32 @@ def load_robot(name: str) -> Robot:
 def load_problem(robot: str, world: str) -> Problem:
     """A robot and a world by name or path; InputError where they do not fit.
 
-    A derived start that violates a row of this world gives way to the nearest of some random ones that do not.
+    A derived start or goal that violates a row of this world gives way to the nearest of some random configurations
+    that do not.
     """
     loaded = load_robot(robot)
     spec = load_world(find_world(world))
     problem = Problem(loaded, world, spec, loaded.safety(spec.obstacles))
-    return _with_clear_start(problem) if "start" in loaded.derived else problem
+    if "start" in loaded.derived and (start := _clear_one(problem, loaded.start, "start")) is not None:
+        problem = dataclasses.replace(problem, robot=dataclasses.replace(loaded, start=start))
+    if "goal" in loaded.derived and (goal := _clear_one(problem, loaded.goal, "goal")) is not None:
+        problem = problem.with_goal(goal)
+    return problem
 
 
-def _with_clear_start(problem: Problem) -> Problem:
-    robot, model, domain = problem.robot, problem.model, problem.robot.domain
-    h, row = problem.safety.least(robot.start)
+def _clear_one(problem: Problem, q: Array, what: str) -> Array | None:
+    """The clear configuration (nq,) nearest to q, with a warning; None where q is clear, or nothing is."""
+    model, domain = problem.model, problem.robot.domain
+    h, row = problem.safety.least(q)
     if h >= 0.0:
-        return problem
-    angles = domain.sample_q(np.random.default_rng(SAMPLE_SEED), STARTS)
+        return None
+    angles = domain.sample_q(np.random.default_rng(SAMPLE_SEED), TRIED)
     clear = np.flatnonzero(problem.safety.first_order(model.from_angles(angles))[0].min(axis=1) >= CLEAR)
     if not len(clear):
-        return problem
-    way = (angles[clear] - model.to_angles(robot.start)) / np.ptp(domain.q, axis=1)
-    start = model.from_angles(angles[clear[np.argmin(np.linalg.norm(way, axis=1))]])
-    model.warnings.append(f"the start that suits most worlds violates '{row}' by {-h:.4f}: another one was taken")
-    return dataclasses.replace(problem, robot=dataclasses.replace(robot, start=start))
+        return None
+    model.warnings.append(f"the {what} that suits most worlds violates '{row}' by {-h:.4f}: another one was taken")
+    way = (angles[clear] - model.to_angles(q)) / np.ptp(domain.q, axis=1)
+    return model.from_angles(angles[clear[np.argmin(np.linalg.norm(way, axis=1))]])
 
 
 def _spec_urdf(path: Path, spec: RobotSpec) -> Path:

@@ -402,6 +402,23 @@ def test_a_derived_start_gives_way_to_what_stands_there(files, tmp_path):
     np.testing.assert_array_equal(model.to_angles(given.robot.start), 0.0)
 
 
+def test_a_derived_goal_gives_way_too(tmp_path):
+    free = load_problem("ur3", "sphere")
+    model, goal = free.model, free.robot.goal
+    hand = free.safety.points.kinematics(model.evaluate(goal, np.zeros(6))).p[-1]
+    ball = f"{{name: ball, type: sphere, center: {hand.round(3).tolist()}, radius: 0.05}}"
+    (tmp_path / "ball.yaml").write_text(f"obstacles: [{ball}]\n")
+    problem = load_problem("ur3", str(tmp_path / "ball.yaml"))
+    assert problem.safety.least(goal)[0] < 0.0 < 0.05 <= problem.safety.least(problem.robot.goal)[0]
+    assert np.linalg.norm(model.to_angles(problem.robot.goal) - model.to_angles(goal)) < 2.5  # rad, of six joints
+    np.testing.assert_array_equal(problem.robot.start, free.robot.start)
+    assert "the goal that suits most worlds violates" in problem.model.warnings[-1]
+    given = f"urdf: ur3_robot\ngoal: {model.to_angles(goal).tolist()}\neffort: 50\n"
+    (tmp_path / "given.yaml").write_text(given)
+    kept = load_problem(str(tmp_path / "given.yaml"), str(tmp_path / "ball.yaml"))
+    np.testing.assert_allclose(kept.robot.goal, goal)
+
+
 @pytest.mark.parametrize(
     ("text", "values"),
     [("1, 2", [1.0, 2.0]), ("-1e-3", [-0.001]), ("1.5,-2,", [1.5, -2.0]), (None, None)],
