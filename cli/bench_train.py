@@ -25,10 +25,12 @@ def train(
     import torch  # takes seconds: only where it is needed
 
     from ppcbf_robots.learning.presets import PRESETS
+    from ppcbf_robots.learning.threads import use_threads
     from ppcbf_robots.learning.throughput import measure_training
 
     problem = load_problem(robot, obstacles)
     torch.set_num_threads(1)  # as in training
+    use_threads(1)  # to be compared with a core's matrix product
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     cases = [measure_training(problem, k, p, device, iterations) for k, p in PRESETS.items() for device in devices]
     if json:

@@ -163,7 +163,7 @@ def _print_robot(robot: Robot, facts: dict[str, Any]) -> None:
 
 
 def _print_world(problem: Problem, facts: dict[str, Any]) -> None:
-    title = f"world {problem.world_name}: {problem.safety.pairs} pairs with the body"
+    title = f"world {problem.world_name}: {problem.safety.obstacle_pairs} pairs with the body"
     gaps = [f"{facts['smoothing_gap_mm'][o.name]:.1f}" for o in problem.world.obstacles]
     rows = [[*row, gap] for row, gap in zip(obstacle_rows(problem.world), gaps, strict=True)]
     table(title, ["obstacle", "type", "", "smoothing gap [mm]"], rows)

@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -41,6 +41,12 @@ def alarms_expected() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
+
+
+def warn(warnings: Sequence[str]) -> None:
+    """A line each, on standard error."""
+    for warning in warnings:
+        err.print(f"warning: {warning}", style="yellow", soft_wrap=True)
 
 
 def emit_json(data: dict[str, Any]) -> None:

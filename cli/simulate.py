@@ -13,7 +13,7 @@ from rich.progress import track
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, warn
 from ppcbf_robots.engines import Engine, EngineName
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
@@ -68,6 +68,13 @@ def simulate(
     if goal is not None:
         problem = problem.with_goal(_angles(problem, goal, "--goal", problem.robot.goal))
     problem.check_start(q)
+    h, row = problem.safety.least(problem.robot.goal)
+    warn(
+        [
+            *model.warnings,
+            *([] if h >= 0.0 else [f"the goal violates '{row}' by {-h:.4f}: the arm will rest before it"]),
+        ]
+    )
     if out_file.is_dir():
         raise InputError(f"--out: {out_file} is a folder; give a file such as {out_file}/trajectory.npz")
     dt = RK4_STEP * max(1, round(1.0 / (rate * RK4_STEP)))  # whole integration steps
@@ -203,7 +210,7 @@ def _print(facts: dict[str, Any], trajectory: Trajectory, problem: Problem) -> N
         f"{problem.robot.name} in {problem.world_name}: {meta['barrier_kind']}, {meta['filter']}, {meta['metric']}"
         + (f"; engine {meta['engine']}" if meta["engine"] != "pinocchio" else "")
     )
-    out.print(f"least h            {facts['min_h']:.4f}  (obstacles alone {facts['clearance']:.4f} m)")
+    out.print(f"least h            {facts['min_h']:.4f}  (without joint limits {facts['clearance']:.4f} m)")
     out.print(f"largest torque     {facts['max_torque_ratio']:.3f} of its limit")
     if facts["rate_violations"] is not None:
         over = f", over it in {facts['rate_violations']} steps" if facts["rate_violations"] else ""

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, warn
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.robot import RobotModel
@@ -57,8 +57,7 @@ def train(
         problem = problem.with_barrier_spec(validate(given, BarrierSpec, "--gamma"))
     if out_dir.exists() and not out_dir.is_dir():
         raise InputError(f"--out: {out_dir} is a file; give a folder")
-    for warning in problem.model.warnings:
-        err.print(f"warning: {warning}", style="yellow", soft_wrap=True)
+    warn(problem.model.warnings)
     states = None if counterexamples is None else load_states(counterexamples, problem.model)
     report = train_barrier(
         problem, barrier, preset, seed, out_dir, device, iterations, time_limit, resume, tensorboard, states

@@ -68,10 +68,11 @@ def draw(problem: Problem, barrier: Barrier | None, drawing: Drawing, index: int
 
 
 def _clear(problem: Problem, rng: np.random.Generator) -> Iterator[Array]:
-    """Uniform configurations (nq,) of X with ``h >= CLEAR``; InputError if they are too rare."""
+    """Uniform configurations (nq,) of X with ``h >= CLEAR``, as far as a row has that; InputError if they are rare."""
+    wanted, rest = problem.attainable(CLEAR), np.zeros(problem.model.nv)
     for _ in range(TRIES):
         q = problem.model.from_angles(problem.robot.domain.sample_q(rng, 1)[0])
-        if problem.safety.least(q)[0] >= CLEAR:
+        if np.all(problem.safety.evaluate(problem.model.evaluate(q, rest)).h >= wanted):
             yield q
     raise InputError(
         f"no start or goal found in {TRIES:,} uniform configurations of X (least h of {CLEAR:g} m or rad, and phi >= 0 "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ppcbf_robots.controllers import Gains
@@ -55,10 +57,11 @@ class Domain:
         return np.where(near, np.clip(close, self.q[:, 0], self.q[:, 1]), q), v
 
 
-def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
+def derive_domain(robot: RobotModel, spec: DomainSpec, kept: Sequence[Array] = ()) -> Domain:
     """Given bounds, else the URDF's position limits (half a turn where there are none) and ± the velocity limits.
 
-    Derived position ranges leave out postures that the motors cannot hold; see :func:`ppcbf_robots.holdable.holdable`.
+    Derived position ranges leave out postures that the motors cannot hold, and keep the configurations ``kept`` (nv,):
+    see :func:`ppcbf_robots.holdable.holdable`.
     """
     low, high = robot.q_lower, robot.q_upper
     lower = np.where(np.isfinite(low), low, np.minimum(-WIDE_TURN, high - 2.0 * WIDE_TURN))
@@ -67,14 +70,14 @@ def derive_domain(robot: RobotModel, spec: DomainSpec) -> Domain:
     for name, given in (("q", spec.q), ("v", spec.v)):
         if given is not None and len(given) != robot.nv:
             raise InputError(f"domain.{name}: expected {robot.nv} pairs, one per moving joint, got {len(given)}")
-    q = _narrowed(robot, q) if spec.q is None else np.asarray(spec.q, float)
+    q = _narrowed(robot, q, np.reshape(kept, (-1, robot.nv))) if spec.q is None else np.asarray(spec.q, float)
     v = v if spec.v is None else np.asarray(spec.v, float)
     return Domain(q, v)
 
 
-def _narrowed(robot: RobotModel, q: Array) -> Array:
+def _narrowed(robot: RobotModel, q: Array, kept: Array) -> Array:
     """q (nv, 2) without the postures that cannot be held, which a warning names."""
-    box = holdable(robot, q)
+    box = holdable(robot, q, kept)
     for i in np.flatnonzero(np.any(box != q, axis=1)):
         robot.warnings.append(
             f"X has joint '{robot.joint_names[i]}' between {box[i, 0]:.2f} and {box[i, 1]:.2f} only, instead of "

@@ -88,7 +88,13 @@ def derive_body(robot: RobotModel) -> Body:
 
 def derive_fixed(robot: RobotModel) -> Body:
     """Spheres whose union contains the surface of every link that no joint moves: base, torso, a locked arm."""
-    shapes = _by(robot, pin.GeometryType.COLLISION, "parentFrame", fixed=True)
+    shapes = _by(robot, pin.GeometryType.VISUAL, "parentFrame", fixed=True)
+    found = _by(robot, pin.GeometryType.COLLISION, "parentFrame", fixed=True)
+    lent = sorted(robot.model.frames[frame].name for frame in shapes.keys() - found.keys())
+    if lent:
+        names = ", ".join(f"'{name}'" for name in lent)
+        robot.warnings.append(f"no collision geometry at link {names}: self-collision keeps off the visual geometry")
+    shapes |= found
     frames = {frame: robot.model.frames[frame] for frame in shapes}
     facts = [[frames[f].name, frames[f].placement.homogeneous.tolist(), digest(x)] for f, x in shapes.items()]
     return _recalled(facts, lambda: [_fixed_cover(frames[f], x) for f, x in shapes.items()])

@@ -161,7 +161,7 @@ class Loop:
         """The fault happens from the next step on."""
         safety, q = self.problem.safety, self.engine.state()[0]
         rows = safety.evaluate(self.problem.model.evaluate(q, np.zeros(self.problem.model.nv)))
-        k = int(np.argmin(rows.h[: safety.pairs - len(self.problem.robot.self_pairs)]))
+        k = int(np.argmin(rows.h[: safety.obstacle_pairs]))
         i, o = divmod(k, len(safety.obstacles))
         p = safety.points.kinematics(self.problem.model.evaluate(q, np.zeros(self.problem.model.nv))).p[i]
         turn, origin = safety.packed.frames[o, :, :3], safety.packed.frames[o, :, 3]

@@ -16,12 +16,13 @@ MOST_CUT = 0.5
 LEAST_VOLUME = 0.05  # of the box; less is no room to work in
 
 
-def holdable(robot: RobotModel, q: Array) -> Array:
+def holdable(robot: RobotModel, q: Array, given: Array) -> Array:
     """The position ranges q (nv, 2), narrowed until gravity leaves a tenth of every effort limit, if it breaks one.
 
     Each cut moves one bound of one joint: the one that takes most of the postures that cannot be held for the volume it
-    costs. Joints that turn freely are not cut, since nothing keeps them within less than a turn. The ranges stay as
-    they are where every posture can be held, and where less than a twentieth of the volume would be left.
+    costs. Joints that turn freely are not cut, since nothing keeps them within less than a turn, and configurations
+    ``given`` (K, nv) stay inside. The ranges stay as they are where every posture can be held, and where less than a
+    twentieth of the volume would be left.
     """
     angles = np.random.default_rng(SAMPLE_SEED).uniform(q[:, 0], q[:, 1], (SAMPLES, robot.nv))
     load = np.max([np.abs(robot.gravity(c)) for c in robot.from_angles(angles)] / robot.u_max, axis=1)
@@ -29,7 +30,9 @@ def holdable(robot: RobotModel, q: Array) -> Array:
     if load.max() <= 1.0 or not len(bounded):
         return box
     while (heavy := load[inside] > HELD).any():
-        joint, side, bound = _best_cut(angles[inside], heavy, bounded)
+        joint, side, bound = _best_cut(angles[inside], heavy, bounded, given)
+        if side < 0:
+            return q.copy()
         box[joint, side] = bound
         inside = np.all((angles >= box[:, 0]) & (angles <= box[:, 1]), axis=1)
         if inside.mean() < LEAST_VOLUME:
@@ -37,21 +40,27 @@ def holdable(robot: RobotModel, q: Array) -> Array:
     return box
 
 
-def _best_cut(angles: Array, heavy: NDArray[np.bool_], joints: NDArray[np.int64]) -> tuple[int, int, float]:
+def _best_cut(
+    angles: Array, heavy: NDArray[np.bool_], joints: NDArray[np.int64], given: Array
+) -> tuple[int, int, float]:
     """(joint, 0 for its lower and 1 for its upper bound, new bound) from configurations (B, nv), some too heavy.
 
-    What is made large is the fall of the share of heavy ones, as a logarithm, over that of the volume.
+    The side is -1 where no cut spares all that are given. What is made large is the fall of the share of heavy ones, as
+    a logarithm, over that of the volume.
     """
     count = len(angles)
     removed = np.arange(max(1, int(LEAST_CUT * count)), int(MOST_CUT * count) + 1)
     share_left = (count - removed) / count
-    best, cut = -np.inf, (0, 0, 0.0)
+    best, cut = -np.inf, (0, -1, 0.0)
     for joint in joints:
         for side in (0, 1):
             order = np.argsort(angles[:, joint])[:: 1 - 2 * side]
             left = heavy.sum() - np.cumsum(heavy[order])[removed - 1]
             gain = np.log(np.maximum(left, 0.2) / heavy.sum() / share_left) / np.log(share_left)
+            bound = angles[order[removed], joint]
+            outside = given[:, joint, None] < bound if side == 0 else given[:, joint, None] > bound
+            gain[outside.any(axis=0)] = -np.inf
             if gain.max() > best:
-                best, at = gain.max(), removed[int(np.argmax(gain))]
-                cut = int(joint), side, float(angles[order[min(at, count - 1)], joint])
+                best, at = gain.max(), int(np.argmax(gain))
+                cut = int(joint), side, float(bound[at])
     return cut

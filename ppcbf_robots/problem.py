@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -26,7 +27,10 @@ from ppcbf_robots.specs import Array, BarrierSpec, BodySphere, RobotSpec, load_s
 from ppcbf_robots.world import Obstacle, WorldSpec
 from ppcbf_robots.world_files.load import load_world
 
-CLEAR = 0.05  # [m | rad] of everything, where a start or goal is looked for
+CLEAR = 0.05  # [m | rad] of everything, where a start or goal is looked for,
+ATTAINABLE = 0.2  # or this share of what a row ever has: a shoulder may always be closer to the floor
+COARSE = 0.1  # [m], overestimate of what is fixed to the base, that is told
+APART = 0.2  # shares of X, between start and goal
 TRIED = 2_000  # configurations among which it is
 POSTURES = 500  # in which spheres of the body are looked at for overlap
 GUARDED = 0.99  # of X's velocities, where the filter's rows hold them: room for what happens within a control period
@@ -91,6 +95,15 @@ class Problem:
         robot = dataclasses.replace(self.robot, spec=self.robot.spec.model_copy(update={"barrier": spec}))
         return dataclasses.replace(self, robot=robot)
 
+    def attainable(self, clear: float) -> Array:
+        """(rows,): ``clear`` [m | rad], or a fifth of the largest h that a row has in random configurations of X."""
+        return np.clip(ATTAINABLE * self._largest_h, 0.0, clear)
+
+    @functools.cached_property
+    def _largest_h(self) -> Array:
+        angles = self.robot.domain.sample_q(np.random.default_rng(SAMPLE_SEED), TRIED)
+        return np.asarray(self.safety.first_order(self.model.from_angles(angles))[0].max(axis=0))
+
     def check_start(self, q: Array) -> None:
         """Refuse a start configuration inside an obstacle or beyond a joint limit."""
         h, row = self.safety.least(q)
@@ -148,15 +161,17 @@ def load_robot(name: str) -> Robot:
         urdf, dirs, spec.locked, spec.effort, spec.velocity, spec.payload, spec.moving, spec.position, spec.effort_rate
     )
     model.warnings += [spec.note] if spec.note else []
-    domain = derive_domain(model, spec.domain)
+    start, goal = (None if x is None else vector(x, model.nv, f"{path}: {what}")
+                   for what, x in (("start", spec.start), ("goal", spec.goal)))  # fmt: skip
+    domain = derive_domain(model, spec.domain, [x for x in (start, goal) if x is not None])
     model.check_mass_matrix(domain.sample_q(np.random.default_rng(SAMPLE_SEED), 100))
     derived = [k for k in ("controller", "body", "start", "goal") if getattr(spec, k) is None]
     derived += [f"domain.{k}" for k in ("q", "v") if getattr(spec.domain, k) is None]
     model.points([s.frame for s in spec.body or []], np.array([s.center for s in spec.body or []]))  # the frames exist
     cover = derive_body(model) if spec.body is None else None
     body = body_spheres(spec.body or []) if cover is None else cover.spheres
-    start = _default_start(model, domain) if spec.start is None else vector(spec.start, model.nv, f"{path}: start")
-    goal = _default_goal(start, domain) if spec.goal is None else vector(spec.goal, model.nv, f"{path}: goal")
+    start = _default_start(model, domain) if start is None else start
+    goal = _default_goal(start, domain) if goal is None else goal
     velocity = spec.start_velocity or [0.0] * model.nv
     gains = derive_gains(model, spec.controller, domain)
     controller = NominalController(model, gains, model.from_angles(goal))
@@ -166,9 +181,14 @@ def load_robot(name: str) -> Robot:
     if spec.self_collision is not None:
         fixed, srdf = derive_fixed(model), spec.self_collision.srdf
         file = None if srdf is None else path.parent / srdf
-        random = domain.sample_q(np.random.default_rng(SAMPLE_SEED), POSTURES)
-        postures = np.concatenate([q_start[None], model.from_angles(random)])
-        pairs = self_pairs(model, body, fixed.spheres, postures, file, fitted=spec.body is None)
+        postures = model.from_angles(domain.sample_q(np.random.default_rng(SAMPLE_SEED), POSTURES))
+        given = None if spec.start is None else q_start
+        pairs = self_pairs(model, body, fixed.spheres, given, postures, file, fitted=spec.body is None)
+        model.warnings += [
+            f"link '{x.link}' is fixed to the base, and the spheres that keep off it reach {x.largest:.2f} m beyond: "
+            "a box among the obstacles fits closer"
+            for x in fixed.links if x.largest > COARSE
+        ]  # fmt: skip
     return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, fixed, cover)
 
 
@@ -181,26 +201,36 @@ def load_problem(robot: str, world: str) -> Problem:
     loaded = load_robot(robot)
     spec = load_world(find_world(world))
     problem = Problem(loaded, world, spec, loaded.safety(spec.obstacles))
-    if "start" in loaded.derived and (start := _clear_one(problem, loaded.start, "start")) is not None:
+    if "start" in loaded.derived and (start := _clear_one(problem, loaded.start, "start", None)) is not None:
         problem = dataclasses.replace(problem, robot=dataclasses.replace(loaded, start=start))
-    if "goal" in loaded.derived and (goal := _clear_one(problem, loaded.goal, "goal")) is not None:
+    if "goal" in loaded.derived and (goal := _clear_one(problem, loaded.goal, "goal", problem.robot.start)) is not None:
         problem = problem.with_goal(goal)
     return problem
 
 
-def _clear_one(problem: Problem, q: Array, what: str) -> Array | None:
-    """The clear configuration (nq,) nearest to q, with a warning; None where q is clear, or nothing is."""
+def _clear_one(problem: Problem, q: Array, what: str, other: Array | None) -> Array | None:
+    """The clear configuration (nq,) nearest to q and apart from ``other``, or None where q is clear; with a warning."""
     model, domain = problem.model, problem.robot.domain
     h, row = problem.safety.least(q)
     if h >= 0.0:
         return None
     angles = domain.sample_q(np.random.default_rng(SAMPLE_SEED), TRIED)
-    clear = np.flatnonzero(problem.safety.first_order(model.from_angles(angles))[0].min(axis=1) >= CLEAR)
-    if not len(clear):
+
+    def way(to: Array) -> Array:
+        """(TRIED,): length of the way between the configurations and one of them, in shares of X."""
+        change = angles - model.to_angles(to)
+        change = np.where(model.continuous, (change + np.pi) % (2.0 * np.pi) - np.pi, change)
+        return np.asarray(np.linalg.norm(change / np.ptp(domain.q, axis=1), axis=1))
+
+    rows, apart = problem.safety.first_order(model.from_angles(angles))[0], other is None or way(other) >= APART
+    clear = apart & np.all(rows >= problem.attainable(CLEAR), axis=1)
+    clear = clear if clear.any() else apart & np.all(rows >= 0.0, axis=1)
+    said = f"the {what} that suits most worlds violates '{row}' by {-h:.4f}"
+    if not clear.any():
+        model.warnings.append(f"{said}, and none of {TRIED:,} others is clear: give one")
         return None
-    model.warnings.append(f"the {what} that suits most worlds violates '{row}' by {-h:.4f}: another one was taken")
-    way = (angles[clear] - model.to_angles(q)) / np.ptp(domain.q, axis=1)
-    return model.from_angles(angles[clear[np.argmin(np.linalg.norm(way, axis=1))]])
+    model.warnings.append(f"{said}: another one was taken")
+    return model.from_angles(angles[np.argmin(np.where(clear, way(q), np.inf))])
 
 
 def _spec_urdf(path: Path, spec: RobotSpec) -> Path:

@@ -40,7 +40,7 @@ class Trajectory:
     u: Array  # (T, nv) applied torque
     u_des: Array  # (T, nv)
     h: Array  # (T,)
-    clearance: Array  # (T,) least h over the obstacle pairs alone [m]
+    clearance: Array  # (T,) least h over obstacles and self-collision pairs, without limits [m]
     phi: Array  # (T,)
     V: Array  # (T,) storage [J]
     active: Array  # (T,) bool: the filter changed the torque

@@ -17,10 +17,11 @@ import numpy as np
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.kernels import nearest_rows_at, rows_at
 from ppcbf_robots.robot import Dynamics, RobotModel
-from ppcbf_robots.shapes import Packed, pack
+from ppcbf_robots.shapes import Packed, pack, smoothing_gap
 from ppcbf_robots.specs import Array, BodySphere
 from ppcbf_robots.world import Obstacle
 
+ON_SURFACE = 1e-6  # [m], by which the base may be inside an obstacle that it stands on
 SPEED_SIDES = ("lowest", "highest")  # order of a joint's two rows that keep it in the velocity domain
 
 
@@ -52,7 +53,8 @@ class NearestRows:
 class SafetyFunction:
     """All rows h_k of a robot in a world.
 
-    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, joint by joint. ``limits`` holds
+    ``names`` holds the names of the ``rows`` rows, then those of the velocity ranges, joint by joint. The first
+    ``obstacle_pairs`` rows are those of obstacles; with those of self-collision they are ``pairs``. ``limits`` holds
     (joint, sign, bound) of the joint limits among the rows: ``h = sign (q - bound)``.
 
     Args:
@@ -85,7 +87,7 @@ class SafetyFunction:
         self.robot, self.body, self.obstacles = robot, list(body), list(obstacles)
         self.packed = pack(obstacles)
         for i, o in enumerate(self.obstacles):
-            if self.packed.distance(i, np.zeros(3)) < 0.0:
+            if self.packed.distance(i, np.zeros(3)) + smoothing_gap(o) < -ON_SURFACE:
                 raise InputError(f"obstacle '{o.name}' contains the robot's base (the origin); move or shrink it")
         everything = [*body, *fixed]
         self.points = robot.points([s.frame for s in body], np.array([s.center for s in body]))
@@ -98,6 +100,7 @@ class SafetyFunction:
         self._limit_bound = np.array([b for _, _, b in self.limits])
         labels = [f"{s.frame}#{i}" for i, s in enumerate(everything)]
         self.names = [f"{b} / {o.name}" for b in labels[: len(body)] for o in self.obstacles]
+        self.obstacle_pairs = len(self.names)
         self.names += [f"{labels[a]} / {labels[b]}" for a, b in self._self_pairs]
         self.pairs = len(self.names)
         self.names += [f"{robot.joint_names[i]} {'lower' if sign > 0 else 'upper'} limit" for i, sign, _ in self.limits]

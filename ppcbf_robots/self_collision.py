@@ -8,28 +8,35 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from ppcbf_robots.robot import BodyPoints, RobotModel
 from ppcbf_robots.specs import Array, BodySphere
 from ppcbf_robots.urdf import parse_xml
 
-OFTEN = 0.2  # of random postures, in which spheres that overlap say more of the cover than of the links
+OFTEN = 0.1  # of random postures, in which spheres overlap, or
+CLOSE = 0.03  # [m], nearer than which they always are: is it the links, or are the spheres too coarse?
+ALWAYS = 0.9  # of all postures, in which spheres overlap or links meet that are built that way
+RARELY = 0.1  # of the postures that a row would forbid: less, in which the links meet, is not worth it
 
 
 def self_pairs(
     robot: RobotModel,
     body: Sequence[BodySphere],
     fixed: Sequence[BodySphere],
+    start: Array | None,
     postures: Array,
     srdf: Path | None,
     fitted: bool,
 ) -> list[tuple[int, int]]:
     """Pairs (i, j) of spheres that become rows; those of ``fixed``, which no joint moves, follow the body's.
 
-    Left out are spheres of one joint or of a joint and its parent, links whose collision the SRDF disables, fixed ones
-    that a sphere cannot reach, and pairs that overlap in the first of ``postures`` (B, nq), the start, or in a fifth of
-    the others, random ones: there the spheres are coarser than the links. A fitted body sphere covers any of the links
-    that its joint carries: a pair is left out where all of theirs are disabled.
+    Left out are spheres of neighbours (one joint, a joint and its parent, the first joints and the link that carries
+    them), links whose collision the SRDF disables, fixed ones that a sphere cannot reach, and pairs that overlap in a
+    given ``start`` (nq,). So are pairs that overlap in a tenth of ``postures`` (B, nq), random ones, or never part by
+    more than 3 cm, where that says more of the cover than of the links: these never meet, or hardly ever where the
+    spheres do, or always, being built that way. A fitted body sphere covers any of the links that its joint carries: a
+    pair is left out where all of theirs are disabled.
     """
     spheres = [*body, *fixed]
     points = robot.points([s.frame for s in spheres], np.array([s.center for s in spheres]))
@@ -37,30 +44,80 @@ def self_pairs(
     disabled = set() if srdf is None else disabled_links(srdf)
     _warn_of_strangers(robot, srdf, disabled)
     carried = _carried(robot) if fitted else {}
-    links = [carried.get(int(j), {s.frame}) for s, j in zip(spheres, joints, strict=True)]
+    links = [carried.get(int(j), {s.frame}) if j else {s.frame} for s, j in zip(spheres, joints, strict=True)]
     p = points.kinematics(robot.evaluate_batch(postures, np.zeros((len(postures), robot.nv)))).p
     root, reach = _reach(robot, points)
-    found, touching = [], 0
+    radii = np.array([s.radius for s in spheres])
+    at_start = None if start is None else points.kinematics(robot.evaluate(start, np.zeros(robot.nv))).p
+    found: list[tuple[int, int]] = []
+    left_out: dict[str, set[str]] = {}
+    meets: dict[tuple[frozenset[str], frozenset[str]], NDArray[np.bool_] | None] = {}
     for i, j in combinations(range(len(spheres)), 2):
         a, b = int(joints[i]), int(joints[j])
-        if a == b or parents[a] == b or parents[b] == a:
+        if a == b or (a and b and parents[a] == b) or (b and parents[b] == a):
+            continue
+        if b == 0 and parents[a] == 0 and spheres[j].frame == _carrier(robot, a):
             continue
         if all(frozenset(pair) in disabled for pair in product(links[i], links[j])):
             continue
-        both = spheres[i].radius + spheres[j].radius
+        both = radii[i] + radii[j]
         if b == 0 and np.linalg.norm(p[0, j] - root) - reach[i] > both:
             continue
-        overlap = np.linalg.norm(p[:, i] - p[:, j], axis=1) <= both
-        if overlap[0] or overlap[1:].mean() > OFTEN:
-            touching += 1
-            continue
-        found.append((i, j))
-    if touching:
-        robot.warnings.append(
-            f"self-collision: {touching} pairs of spheres overlap at the start, or in a fifth of all postures, and are "
-            "left out"
-        )
+        why, gap = "", np.linalg.norm(p[:, i] - p[:, j], axis=1) - both
+        if at_start is not None and np.linalg.norm(at_start[i] - at_start[j]) <= both:
+            why = "overlap at the start"
+        elif np.mean(gap <= 0.0) > OFTEN or gap.max() < CLOSE:
+            key = frozenset(links[i]), frozenset(links[j])
+            if key not in meets:
+                meets[key] = _meets(robot, *key, postures)
+            why = _coarse(gap <= 0.0, meets[key])
+        if why:
+            left_out.setdefault(why, set()).add(f"{spheres[i].frame} / {spheres[j].frame}")
+        else:
+            found.append((i, j))
+    robot.warnings += [
+        f"self-collision: spheres of {', '.join(sorted(names))} {why}, and are left out"
+        for why, names in left_out.items()
+    ]
     return found
+
+
+def _coarse(overlap: NDArray[np.bool_], meets: NDArray[np.bool_] | None) -> str:
+    """Why spheres that often overlap (B,) say nothing of links that do or do not meet (B,); empty where they do."""
+    if np.mean(overlap) > ALWAYS or (meets is not None and np.mean(meets) > ALWAYS):
+        return "nearly always overlap"
+    if meets is None:  # no geometry: nothing is known of the links
+        return ""
+    if not meets.any() or (overlap.any() and np.mean(meets[overlap]) < RARELY):
+        return "are too coarse for links that hardly meet"
+    return ""
+
+
+def _carrier(robot: RobotModel, joint: int) -> str:
+    """The link that carries a joint."""
+    model = robot.model
+    return str(model.frames[model.frames[model.getFrameId(model.names[joint])].parentFrame].name)
+
+
+def _meets(robot: RobotModel, one: frozenset[str], other: frozenset[str], postures: Array) -> NDArray[np.bool_] | None:
+    """Whether geometry of two sets of links meets in the postures (B, nq); None where there is none.
+
+    As for the body's cover it is collision geometry, and visual geometry of links without.
+    """
+    shapes = robot.geometry(pin.GeometryType.COLLISION).copy()
+    there = {o.parentFrame for o in shapes.geometryObjects}
+    for o in robot.geometry(pin.GeometryType.VISUAL).geometryObjects:
+        if o.parentFrame not in there:
+            o.name = f"visual {o.name}"
+            shapes.addGeometryObject(o)
+    of = {i: robot.model.frames[o.parentFrame].name for i, o in enumerate(shapes.geometryObjects)}
+    pairs = [(i, j) for i in of for j in of if of[i] in one and of[j] in other]
+    if not pairs:
+        return None
+    for pair in pairs:
+        shapes.addCollisionPair(pin.CollisionPair(*pair))
+    data, scratch = shapes.createData(), robot.model.createData()
+    return np.array([pin.computeCollisions(robot.model, scratch, shapes, data, q, True) for q in postures])
 
 
 def _reach(robot: RobotModel, points: BodyPoints) -> tuple[Array, Array]:

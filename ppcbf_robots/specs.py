@@ -127,6 +127,15 @@ class RobotSpec(Spec):
     barrier: BarrierSpec = BarrierSpec()
     note: str | None = None  # shown with the warnings, e.g. which data are assumed
 
+    @model_validator(mode="before")
+    @classmethod
+    def _nothing_empty(cls, data: Any) -> Any:
+        for key, value in data.items() if isinstance(data, dict) else ():
+            if value is None:
+                hint = "; for all pairs write `self_collision: {}`" if key == "self_collision" else ""
+                raise ValueError(f"{key}: nothing stands behind the colon; give a value or leave the line out{hint}")
+        return data
+
     @model_validator(mode="after")
     def _ordered(self) -> RobotSpec:
         for joint, (low, high) in self.position.items():

@@ -108,8 +108,8 @@ def safety_rows(safety: SafetyFunction) -> ca.Function:
         InputError: if an obstacle is neither a sphere nor a half-space, or body spheres are watched against each other.
     """
     robot = safety.robot
-    if safety.pairs > len(safety.body) * len(safety.obstacles):
-        raise InputError("the predictive controller knows no self-collision: leave it out of the robot spec")
+    if safety.pairs > safety.obstacle_pairs:
+        raise InputError("self-collision is not written as symbols: leave `self_collision` out of the robot spec here")
     angles = ca.SX.sym("q", robot.nv)
     frames = _frames(robot, angles)
     h = []

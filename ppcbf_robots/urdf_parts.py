@@ -18,8 +18,7 @@ UNSPECIFIED = 1e9  # limits from here on say "no limit known"
 ROUNDING = 1e-12  # [kg m²]; exporters leave such negative moments
 INERTIA_FLOOR = -1e-3  # least eigenvalue of an inertia over its largest that passes as rounding
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-SHAPES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1},
-          "capsule": {"radius": 1, "length": 1}}  # fmt: skip
+SHAPES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
 
 
 @dataclass(frozen=True)
@@ -128,8 +127,14 @@ def clean_link(path: Path, link: Element, warnings: list[str]) -> Element:
     if inertial is not None:
         _inertial(path, inertial, new, name, warnings)
     for kind in ("visual", "collision"):
-        for shape in link.findall(kind):
-            _shape(path, shape, new, f"link '{name}'", warnings)
+        shapes = link.findall(kind)
+        unknown = sorted({form.tag for shape in shapes for form in shape.findall("geometry/*")} - {"mesh", *SHAPES})
+        if unknown:  # half a link would pass for the whole
+            named = ", ".join(f"<{tag}>" for tag in unknown)
+            warnings.append(f"link '{name}': its {kind} geometry was left out, since {named} is no shape of URDF")
+            continue
+        for shape in shapes:
+            _shape(path, shape, new, f"link '{name}'")
     return new
 
 
@@ -160,23 +165,20 @@ def least_eigenvalue(inertia: Array) -> float:
     return float(values[0]) if values[0] < INERTIA_FLOOR * abs(values[-1]) - ROUNDING else max(float(values[0]), 0.0)
 
 
-def _shape(path: Path, shape: Element, link: Element, where: str, warnings: list[str]) -> None:
+def _shape(path: Path, shape: Element, link: Element, where: str) -> None:
     geometry = shape.find("geometry")
     for form in [] if geometry is None else list(geometry)[:1]:
         attributes = {}
         if form.tag == "mesh":
             scale = _numbers(path, form.get("scale") or "1 1 1", f"{where}, mesh scale", 3, MOST)
             attributes = {"filename": (form.get("filename") or "").strip(), "scale": _text(scale)}
-        elif form.tag in SHAPES:
+        else:
             for key, count in SHAPES[form.tag].items():
                 what = f"{where}, {form.tag} {key}"
                 sizes = _numbers(path, form.get(key) or "", what, count, MOST_LENGTH)
                 if min(sizes) < 0.0:
                     raise InputError(f"{path}: {what}: {min(sizes)} is negative; correct it")
                 attributes[key] = _text(sizes)
-        else:
-            warnings.append(f"{where}: the unknown shape <{form.tag}> was left out")
-            continue
         new = SubElement(link, shape.tag)
         _origin(path, shape, new, where)
         SubElement(SubElement(new, "geometry"), form.tag, attributes)

@@ -20,6 +20,7 @@ from ppcbf_robots.errors import InputError
 from ppcbf_robots.filters import FilterConfig, Status
 from ppcbf_robots.lockstep import Case, simulate_together
 from ppcbf_robots.plant import perturbed
+from ppcbf_robots.problem import load_problem
 from ppcbf_robots.pushes import Push, PushedEngine, push_torques
 from ppcbf_robots.resources import find_robot
 from ppcbf_robots.rollout import FIELDS, Trajectory, simulate
@@ -141,11 +142,13 @@ def test_starts_are_safe_and_reproducible(problem):
     assert len(set(speeds)) == 20
 
 
-def test_a_world_without_room_is_refused(two_link, monkeypatch):
+def test_a_world_without_room_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("ppcbf_robots.campaign.TRIES", 50)
-    monkeypatch.setattr("ppcbf_robots.campaign.CLEAR", 100.0)
+    wall = "{name: everywhere, type: half_space, normal: [0, 0, 1], offset: -0.1, margin: 3.0}"
+    (tmp_path / "world.yaml").write_text(f"obstacles: [{wall}]\n")
+    problem = load_problem("two_link", str(tmp_path / "world.yaml"))
     with pytest.raises(InputError, match="no start or goal found in 50 uniform configurations"):
-        draw(two_link, None, Drawing(), 0)
+        draw(problem, None, Drawing(), 0)
 
 
 def test_pushes_act_in_their_time_and_their_work_is_known(two_link):
@@ -250,7 +253,6 @@ def test_results_with_other_torque_rates_are_other_results(tmp_path: Path):
 
 
 def _two_link():
-    from ppcbf_robots.problem import load_problem
 
     return load_problem("two_link", "circle")
 

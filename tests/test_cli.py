@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -182,6 +183,13 @@ def test_info_warns_of_a_start_and_goal_in_an_obstacle(tmp_path):
     start, goal = facts("info", "two_link", world)["warnings"][-2:]
     assert start.startswith("the start configuration violates 'tip#0 / everywhere' by ")
     assert goal.startswith("the goal violates 'tip#0 / everywhere' by ")
+
+
+def test_simulate_warns_of_a_goal_in_an_obstacle(tmp_path):
+    world = tmp_path / "world.yaml"
+    world.write_text("obstacles: [{name: ball, type: sphere, center: [-0.017, 0, 0.577], radius: 0.05}]\n")
+    run = run_cli("simulate", "two_link", world, "--duration", "0.01", "--out", tmp_path / "run.npz")
+    assert re.search(r"warning: the goal violates 'tip#0 / ball' by 0\.\d+: the arm will rest before it", run.stderr)
 
 
 # From training to export

@@ -15,6 +15,7 @@ LINK = """<link name="{name}"><inertial><origin xyz="1 0 0"/><mass value="{mass}
 JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 1 0"/>
   <origin xyz="{at}"/><limit lower="-1.5" upper="1.5" effort="{effort}" velocity="2"/></joint>"""
 WEIGHT = 9.81  # [N m], of 1 kg at 1 m
+NONE = np.zeros((0, 1))  # configurations that are given
 
 
 def load(robot: RobotModel, box: Array, count: int = 50_000) -> Array:
@@ -37,12 +38,12 @@ def pendulum(folder, effort: float, kind: str = "revolute", arm: bool = False) -
 
 def test_what_can_be_held_is_left_alone(tmp_path):
     box = np.array([[-1.5, 1.5]])
-    np.testing.assert_array_equal(holdable(pendulum(tmp_path, 1.001 * WEIGHT), box), box)
+    np.testing.assert_array_equal(holdable(pendulum(tmp_path, 1.001 * WEIGHT), box, NONE), box)
 
 
 def test_a_pendulum_that_cannot_be_held_level(tmp_path):
     """Held where ``|cos q| <= 0.9 · 0.5``: one side of level is left, as far as the samples lie apart."""
-    (box,) = holdable(pendulum(tmp_path, 0.5 * WEIGHT), np.array([[-1.5, 1.5]]))
+    (box,) = holdable(pendulum(tmp_path, 0.5 * WEIGHT), np.array([[-1.5, 1.5]]), NONE)
     edge = np.arccos(HELD * 0.5)
     side = sorted(np.abs(box))
     assert np.sign(box[0]) == np.sign(box[1])
@@ -52,13 +53,21 @@ def test_a_pendulum_that_cannot_be_held_level(tmp_path):
 
 def test_joints_that_turn_freely_are_not_cut(tmp_path):
     robot, box = pendulum(tmp_path, 0.5 * WEIGHT, "continuous"), np.array([[-np.pi, np.pi]])
-    np.testing.assert_array_equal(holdable(robot, box), box)
+    np.testing.assert_array_equal(holdable(robot, box, NONE), box)
+
+
+@pytest.mark.parametrize("given", [1.3, -1.3])
+def test_given_configurations_stay_inside(tmp_path, given):
+    robot, whole = pendulum(tmp_path, 0.5 * WEIGHT), np.array([[-1.5, 1.5]])
+    box = holdable(robot, whole, np.array([[given]]))
+    assert box[0, 0] <= given <= box[0, 1] and load(robot, box).max() <= 1.0
+    np.testing.assert_array_equal(holdable(robot, whole, np.array([[1.3], [-1.3]])), whole)  # on both sides of level
 
 
 def test_too_little_left_is_no_domain(tmp_path):
     """Of the first joint's range 2 % can be held with the second one anywhere, too little to work in."""
     robot, box = pendulum(tmp_path, 0.2 * WEIGHT, arm=True), np.array([[-1.5, 1.5], [-1.5, 1.5]])
-    np.testing.assert_array_equal(holdable(robot, box), box)
+    np.testing.assert_array_equal(holdable(robot, box, np.zeros((0, 2))), box)
 
 
 @pytest.mark.parametrize("name", ["talos_left_arm", "baxter_left"])

@@ -132,7 +132,7 @@ def test_threads_change_nothing(panda, monkeypatch):
     program = [torch.as_tensor(x) for x in (offset, c, 0.1 * rng.normal(size=(count, 7)), rng.uniform(size=count))]
     found = []
     for number in (1, 3):
-        monkeypatch.setattr(threads, "THREADS", number)
+        monkeypatch.setattr(threads, "_threads", number)
         rays = [rays_at(panda, q, v, 6, g) for g in (None, goals)]
         found.append([*(x for r in rays for x in (*r[0].values(), *r[1:])), *best_worst_row(*program)])
     for one, three in zip(*found, strict=True):

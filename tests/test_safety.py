@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from importlib.resources import files
 from pathlib import Path
 
@@ -407,8 +408,41 @@ def test_fixed_spheres_out_of_reach_make_no_pairs(tmp_path, x, pairs):
     body = "body: [{frame: fore, center: [0.35, 0, 0], radius: 0.05}]"
     (tmp_path / "arm.yaml").write_text(f"urdf: arm.urdf\n{body}\nstart: [1.5, 0]\nself_collision: {{}}\n")
     robot = load_problem(str(tmp_path / "arm.yaml"), "circle").robot
-    assert any(s.frame == "post" for s in robot.fixed.spheres)
-    assert len(robot.self_pairs) == pairs
+    posts = [k for k, s in enumerate(robot.fixed.spheres, start=1) if s.frame == "post"]
+    assert len(posts) == 1 and sum(j in posts for _, j in robot.self_pairs) == pairs
+
+
+def test_the_first_link_keeps_off_what_is_fixed(tmp_path):
+    """All fixed links but the one that carries the joint: the upper link of a planar arm against a post."""
+    text = (files("ppcbf_robots.robots") / "two_link.urdf").read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", POST.format(x=0.3)))
+    body = "body: [{frame: upper, center: [0.2, 0, 0], radius: 0.05}]"
+    (tmp_path / "arm.yaml").write_text(f"urdf: arm.urdf\n{body}\nself_collision: {{}}\n")
+    robot = load_problem(str(tmp_path / "arm.yaml"), "circle").robot
+    met = [robot.fixed.spheres[j - 1].frame for i, j in robot.self_pairs if i == 0]
+    assert met == ["post"]
+    lent = [w for w in robot.model.warnings if "no collision geometry at link 'base'" in w]
+    assert lent and any(s.frame == "base" for s in robot.fixed.spheres)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+def test_clear_postures_do_not_collide(tmp_path, name):
+    """Where all rows are positive, collision geometry of links that are no neighbours does not meet, says Coal."""
+    (tmp_path / "arm.yaml").write_text(f"urdf: {name}\nself_collision: {{}}\n")
+    (tmp_path / "far.yaml").write_text("obstacles: [{name: ball, type: sphere, center: [9, 0, 0], radius: 0.1}]\n")
+    problem = load_problem(str(tmp_path / "arm.yaml"), str(tmp_path / "far.yaml"))
+    model, shapes = problem.model, problem.model.geometry(pin.GeometryType.COLLISION)
+    parents, joints = list(model.model.parents), [o.parentJoint for o in shapes.geometryObjects]
+    for i, j in itertools.combinations(range(len(joints)), 2):
+        low, high = sorted((joints[i], joints[j]))
+        if low != high and parents[high] != low:
+            shapes.addCollisionPair(pin.CollisionPair(i, j))
+    data = shapes.createData()
+    q = model.from_angles(problem.robot.domain.sample_q(np.random.default_rng(3), 1500))
+    clear = problem.safety.first_order(q)[0].min(axis=1) >= 0.0
+    collides = np.array([pin.computeCollisions(model.model, model.data, shapes, data, x, True) for x in q])
+    assert 0.2 < clear.mean() < 0.9 and collides.mean() > 0.05
+    assert not np.any(clear & collides)
 
 
 def test_an_srdf_and_fitted_spheres_that_cover_several_links(tmp_path):

@@ -402,6 +402,27 @@ def test_a_derived_start_gives_way_to_what_stands_there(files, tmp_path):
     np.testing.assert_array_equal(model.to_angles(given.robot.start), 0.0)
 
 
+@pytest.mark.parametrize("ground", ["type: box, xyz: [0, 0, -0.05], size: [1.5, 1.5, 0.1]",
+                                    "type: half_space, normal: [0, 0, 1], offset: 0"])  # fmt: skip
+def test_an_arm_may_stand_on_a_table(tmp_path, ground):
+    """Flush with its base, which is the most common of scenes; its shoulder is always closer than 5 cm to it."""
+    (tmp_path / "table.yaml").write_text(f"obstacles: [{{name: ground, {ground}}}]\n")
+    problem = load_problem("ur5", str(tmp_path / "table.yaml"))
+    for q in (problem.robot.start, problem.robot.goal):
+        assert problem.safety.least(q)[0] >= 0.0
+    assert np.abs(problem.model.difference(problem.robot.start, problem.robot.goal)).max() > 0.5
+    sunk = ground.replace("-0.05]", "-0.045]").replace("offset: 0", "offset: 0.005")
+    (tmp_path / "sunk.yaml").write_text(f"obstacles: [{{name: ground, {sunk}}}]\n")
+    with pytest.raises(InputError, match="contains the robot's base"):
+        load_problem("ur5", str(tmp_path / "sunk.yaml"))
+
+
+def test_a_key_without_a_value_is_refused(tmp_path):
+    (tmp_path / "arm.yaml").write_text("urdf: ur5\nself_collision:\n")
+    with pytest.raises(InputError, match="self_collision: nothing stands behind the colon"):
+        load_robot(str(tmp_path / "arm.yaml"))
+
+
 def test_a_derived_goal_gives_way_too(tmp_path):
     free = load_problem("ur3", "sphere")
     model, goal = free.model, free.robot.goal

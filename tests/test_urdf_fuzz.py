@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import os
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -340,6 +341,17 @@ def test_meshes_are_found(tmp_path, name):
     model = RobotModel(path, default_package_dirs(path))
     assert [len(o.geometry.vertices()) for o in model.geometry(pin.GeometryType.VISUAL).geometryObjects] == [4]
     assert model.warnings == ["joint 'slider' mimics another joint and was locked at 0.1"]
+
+
+@pytest.mark.parametrize("shape", ['<capsule radius="0.05" length="0.3"/>', '<ellipsoid radius="0.1 0.1 0.2"/>'])
+def test_a_shape_that_urdf_does_not_know_takes_the_others_of_its_link_along(tmp_path, shape):
+    upper = f'<link name="upper">{INERTIAL}{CYLINDER}'
+    more = f"<collision><geometry>{shape}</geometry></collision>"
+    robot = load_robot(str(written(tmp_path, ARM.replace(upper, upper + more))))
+    tag = re.findall(r"<\w+", shape)[0] + ">"
+    said = f"link 'upper': its collision geometry was left out, since {tag} is no shape of URDF"
+    assert said in robot.model.warnings
+    assert not robot.model.geometry(pin.GeometryType.COLLISION).geometryObjects  # half of a link is not the link
 
 
 def test_missing_meshes_leave_the_dynamics_and_the_other_links(tmp_path):

@@ -13,6 +13,14 @@ LEAST = 256  # states for each thread; fewer are not worth the handing over
 
 Found = TypeVar("Found")
 
+_threads = THREADS
+
+
+def use_threads(count: int) -> None:
+    """Let kernels of this process work in ``count`` threads from now on: 1 where processes share the cores."""
+    global _threads
+    _threads = count
+
 
 def in_threads(count: int, of: Callable[[slice], Found]) -> list[Found]:
     """``of`` slices that together are all of ``count`` states, in order, at once in all threads there are.
@@ -20,11 +28,11 @@ def in_threads(count: int, of: Callable[[slice], Found]) -> list[Found]:
     Kernels let go of the interpreter, and what they find of a state does not depend on the others, so the number of
     threads decides the time alone.
     """
-    parts = min(THREADS, count // LEAST)
+    parts = min(_threads, count // LEAST)
     if parts < 2:
         return [of(slice(0, count))]
     ends = [count * k // parts for k in range(parts + 1)]
-    return list(_pool(parts).map(of, map(slice, ends[:-1], ends[1:])))
+    return list(_pool(_threads).map(of, map(slice, ends[:-1], ends[1:])))
 
 
 @functools.cache

@@ -51,9 +51,11 @@ class Training:
         import torch  # in the worker alone
 
         from ppcbf_robots.learning.store import store
+        from ppcbf_robots.learning.threads import use_threads
         from ppcbf_robots.learning.train import Trainer
 
         torch.set_num_threads(1)
+        use_threads(1)
         trainer = Trainer(load_problem(self.robot, self.world), KIND, self.preset, self.seed, "cpu")
         result = trainer.run(time_limit=self.time_limit)
         report = {
