@@ -79,6 +79,7 @@ class Falsifier:
         self._high = np.concatenate([domain.q[:, 1], domain.v[:, 1], [1.0]])
         self._width = self._high - self._low
 
+    @torch.inference_mode()
     def reserves(self, params: Mapping[str, torch.Tensor], points: Array) -> tuple[Array, Array, Array]:
         """Reserves (B,) of points (B, 2 nv + 1), infinite off the band, and their states q, v.
 

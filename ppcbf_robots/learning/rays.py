@@ -217,7 +217,8 @@ def _rays_at(
 
 def to_tensors(parts: list[RayArrays], device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     """Chunks of arrays as tensors by name."""
-    return {k: torch.as_tensor(np.concatenate([p[k] for p in parts]), device=device, dtype=dtype) for k in parts[0]}
+    arrays = parts[0] if len(parts) == 1 else {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+    return {k: torch.as_tensor(x, device=device, dtype=dtype) for k, x in arrays.items()}
 
 
 def _to_face(v: Array, box: Array) -> tuple[Array, Array]:
