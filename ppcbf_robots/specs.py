@@ -242,7 +242,9 @@ def _first_problem(error: ValidationError, kind: type[Spec]) -> str:
     got = problem.get("input")
     shown = "" if isinstance(got, dict) or got is None else f", got {reprlib.repr(got)}"[:80]
     message = problem["msg"].removeprefix("Value error, ")
-    return f"{key}: {message[0].lower()}{message[1:]}{shown if problem['type'] != 'value_error' else ''}"
+    if problem["type"] == "value_error":
+        return f"{key}: {message}" if loc else message  # of the whole spec: it names the key itself
+    return f"{key}: {message[0].lower()}{message[1:]}{shown}"
 
 
 def per_joint(value: PerJoint, names: Sequence[str], what: str, default: Array | None = None) -> Array:
