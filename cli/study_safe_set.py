@@ -45,7 +45,7 @@ def safe_set(
 
     Volumes are shares of the same uniform states of X. "Not viable" is the share of a set from which no torque within
     the limits avoids a collision; "infeasible" the share of states at a set's boundary where no torque within the
-    limits satisfies its rows.
+    limits satisfies its rows. The PP-CBF's set is a reference only where it is feasible.
 
     Example: ppcbf study safe-set cartpole wall --barrier runs/cartpole --out runs/sets
     """
@@ -60,6 +60,8 @@ def safe_set(
         known = barriers.get(row["set"])
         check = None if known is None else check_boundary(problem, known, boundary, rng)
         row |= {"infeasible": None if check is None else check.share, "boundary": 0 if check is None else check.samples}
+    if any(row["set"] == PP and row["infeasible"] for row in rows):  # a set that no filter can keep is no measure
+        rows = [row | {"of_pp": None, "of_pp_error": None} for row in rows]
     files = [str(out_dir / "volumes.csv"), str(out_dir / "safe_set.png")]
     write_csv(Path(files[0]), rows)
     if problem.model.nv >= 2:

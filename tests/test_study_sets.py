@@ -40,7 +40,8 @@ def test_safe_set_writes_table_and_figure(tmp_path):
     rows = {row["set"]: row for row in facts["rows"]}
     assert list(rows) == ["h >= 0", "viable", "LB-CBF", "PP-CBF"]
     assert rows["h >= 0"]["of_X"] == 1.0
-    assert rows["LB-CBF"]["of_lb"] == rows["PP-CBF"]["of_pp"] == rows["viable"]["of_viable"] == 1.0
+    assert rows["LB-CBF"]["of_lb"] == rows["viable"]["of_viable"] == 1.0
+    assert rows["PP-CBF"]["infeasible"] > 0.0 and all(row["of_pp"] is None for row in rows.values())
     assert rows["viable"]["of_X"] == pytest.approx(1.0 - 1.0 / 9.0, abs=0.03)  # v <= 2 sqrt(h) over X
     assert 0.04 < rows["LB-CBF"]["not_viable"] < 0.08  # 0.051 in closed form
     assert rows["LB-CBF"]["infeasible"] > 0.5
@@ -55,6 +56,7 @@ def test_safe_set_without_a_viable_set(tmp_path, panda):
     facts = run("safe-set", "panda", "sphere", "--out", str(tmp_path), "--samples", "100", "--boundary", "3")
     assert [row["set"] for row in facts["rows"]] == ["h >= 0", "LB-CBF", "PP-CBF"]
     assert facts["rows"][0]["of_viable"] is None
+    assert facts["rows"][2]["infeasible"] == 0.0 and facts["rows"][2]["of_pp"] == 1.0
 
 
 def test_bad_input_of_safe_set(tmp_path):
