@@ -38,6 +38,7 @@ WORLDS = ("table_boxes", "shelf", "pillar")
 SIZED_FOR = 0.92  # [m], reach of the Panda, which the bundled worlds suit
 SHOULDER = 0.333  # [m], height of its first joint
 LB_STATES = 5_000
+STILL = 1e-4  # [rad/s], of the largest joint error: slower is no approach
 DURATIONS = (15.0, 60.0)  # [s]; the longer one where the arm still moves after the shorter
 
 
@@ -156,6 +157,10 @@ def goal_column(c: dict[str, Any]) -> str:
             return ("rests on " if end["constrained_minimum"] else "held by ") + ", ".join(end["held_by"])
         case "stalled":
             return f"at rest, {end['goal_error']:.2f} rad off"
+    if end["held_by"] and abs(end["approach"]) < STILL:
+        return (
+            f"rests on {', '.join(end['held_by'])}; {end['fastest']} still turns at {end['speed']:.2f} {end['unit']}/s"
+        )
     return f"{end['goal_error']:.2f} rad off after {c['duration']:.0f} s, {end['approach']:.4f} rad/s closer"
 
 
