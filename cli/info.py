@@ -96,9 +96,7 @@ def _facts(robot: Robot, problem: Problem | None) -> dict[str, Any]:
                     f"obstacle '{name}' has {planes} supporting planes, and every body sphere is held against each of "
                     "them in every step: simplify the mesh"
                 )
-        goal_h, goal_row = problem.safety.least(robot.goal)
-        if goal_h < 0.0:
-            warnings.append(f"the goal violates '{goal_row}' by {-goal_h:.4f}: the arm will rest before it")
+        warnings += problem.blocked_goal()
     return facts
 
 

@@ -68,13 +68,7 @@ def simulate(
     if goal is not None:
         problem = problem.with_goal(_angles(problem, goal, "--goal", problem.robot.goal))
     problem.check_start(q)
-    h, row = problem.safety.least(problem.robot.goal)
-    warn(
-        [
-            *model.warnings,
-            *([] if h >= 0.0 else [f"the goal violates '{row}' by {-h:.4f}: the arm will rest before it"]),
-        ]
-    )
+    warn([*model.warnings, *problem.blocked_goal()])
     if out_file.is_dir():
         raise InputError(f"--out: {out_file} is a folder; give a file such as {out_file}/trajectory.npz")
     dt = RK4_STEP * max(1, round(1.0 / (rate * RK4_STEP)))  # whole integration steps

@@ -139,20 +139,9 @@ def outside(balls: Balls, directions: int) -> tuple[Array, Array]:
 
 def settings() -> list[float]:
     """The numbers above, on which the result depends."""
-    search = [
-        MAX_BALLS,
-        *MORE_BALLS,
-        ROOMY,
-        POINTS,
-        TRIALS,
-        GRID_POINTS,
-        HOPELESS,
-        WORTH,
-        DIRECTIONS,
-        FINE_DIRECTIONS,
-        ROUND,
-    ]
-    return [LARGEST, THICKNESS_SHARE, SMALLEST, MEAN, MEAN_SHARE, *search, SPACING, SPACING_SHARE, SIDES]
+    aims = [LARGEST, THICKNESS_SHARE, SMALLEST, MEAN, MEAN_SHARE, MAX_BALLS, *MORE_BALLS, ROOMY]
+    search = [POINTS, TRIALS, GRID_POINTS, HOPELESS, WORTH, DIRECTIONS, FINE_DIRECTIONS, ROUND]
+    return [*aims, *search, SPACING, SPACING_SHARE, SIDES]
 
 
 def fit(surface: Surface) -> Fit:

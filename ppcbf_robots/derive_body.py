@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -88,8 +88,8 @@ def derive_body(robot: RobotModel) -> Body:
 
 def derive_fixed(robot: RobotModel) -> Body:
     """Spheres whose union contains the surface of every link that no joint moves: base, torso, a locked arm."""
-    shapes = _by(robot, pin.GeometryType.VISUAL, "parentFrame", fixed=True)
-    found = _by(robot, pin.GeometryType.COLLISION, "parentFrame", fixed=True)
+    shapes = _readable(robot, pin.GeometryType.VISUAL, fixed=True)
+    found = _readable(robot, pin.GeometryType.COLLISION, fixed=True)
     lent = sorted(robot.model.frames[frame].name for frame in shapes.keys() - found.keys())
     if lent:
         names = ", ".join(f"'{name}'" for name in lent)
@@ -131,9 +131,9 @@ def _recalled(facts: list[Any], covers: Callable[[], list[LinkCover]]) -> Body:
 def _shapes(robot: RobotModel) -> dict[int, list[pin.GeometryObject]]:
     """Geometry to cover by moving joint, in the order of the joints."""
     joints = range(1, robot.model.njoints)
-    found = _by(robot, pin.GeometryType.COLLISION, "parentJoint")
+    found = _readable(robot, pin.GeometryType.COLLISION)
     bare = [joint for joint in joints if joint not in found]
-    visual = _by(robot, pin.GeometryType.VISUAL, "parentJoint") if bare else {}
+    visual = _readable(robot, pin.GeometryType.VISUAL) if bare else {}
     lent = [joint for joint in bare if joint in visual]
     if lent:
         names = ", ".join(f"'{_link(robot, joint).name}'" for joint in lent)
@@ -142,10 +142,11 @@ def _shapes(robot: RobotModel) -> dict[int, list[pin.GeometryObject]]:
     return {joint: shapes[joint] for joint in joints if joint in shapes}
 
 
-def _by(
-    robot: RobotModel, kind: pin.GeometryType, parent: Literal["parentJoint", "parentFrame"], fixed: bool = False
-) -> dict[int, list[pin.GeometryObject]]:
-    """Readable shapes of the moving or the fixed links, by joint or frame; none, and a warning, if any is not."""
+def _readable(robot: RobotModel, kind: pin.GeometryType, fixed: bool = False) -> dict[int, list[pin.GeometryObject]]:
+    """Shapes of the moving links by joint, or of the fixed ones by frame.
+
+    None, and a warning, if a mesh is missing or a shape cannot be covered.
+    """
     try:
         objects = [o for o in robot.geometry(kind).geometryObjects if (o.parentJoint == 0) == fixed]
         digest(objects)
@@ -155,7 +156,7 @@ def _by(
         return {}
     found: dict[int, list[pin.GeometryObject]] = {}
     for o in objects:
-        found.setdefault(int(getattr(o, parent)), []).append(o)
+        found.setdefault(int(o.parentFrame if fixed else o.parentJoint), []).append(o)
     return found
 
 

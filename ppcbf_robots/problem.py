@@ -112,6 +112,11 @@ class Problem:
                 f"the start configuration violates '{row}' by {-h:.4f}: give another with --start or in the spec"
             )
 
+    def blocked_goal(self) -> list[str]:
+        """What to tell of a goal that violates a row; empty where it does not."""
+        h, row = self.safety.least(self.robot.goal)
+        return [] if h >= 0.0 else [f"the goal violates '{row}' by {-h:.4f}: the arm will rest before it"]
+
     def fingerprint(self) -> dict[str, str]:
         """SHA-256 of what a barrier depends on: URDF, robot parameters, controller and domain, world."""
         m = self.model

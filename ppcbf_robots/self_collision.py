@@ -51,12 +51,13 @@ def self_pairs(
     at_start = None if start is None else points.kinematics(robot.evaluate(start, np.zeros(robot.nv))).p
     found: list[tuple[int, int]] = []
     left_out: dict[str, set[str]] = {}
-    meets: dict[tuple[frozenset[str], frozenset[str]], NDArray[np.bool_] | None] = {}
+    shapes, meets = None, dict[tuple[frozenset[str], frozenset[str]], NDArray[np.bool_] | None]()
+    carriers = {j: _carrier(robot, j) for j in set(joints.tolist()) if j and parents[j] == 0}
     for i, j in combinations(range(len(spheres)), 2):
         a, b = int(joints[i]), int(joints[j])
         if a == b or (a and b and parents[a] == b) or (b and parents[b] == a):
             continue
-        if b == 0 and parents[a] == 0 and spheres[j].frame == _carrier(robot, a):
+        if b == 0 and carriers.get(a) == spheres[j].frame:
             continue
         if all(frozenset(pair) in disabled for pair in product(links[i], links[j])):
             continue
@@ -69,7 +70,8 @@ def self_pairs(
         elif np.mean(gap <= 0.0) > OFTEN or gap.max() < CLOSE:
             key = frozenset(links[i]), frozenset(links[j])
             if key not in meets:
-                meets[key] = _meets(robot, *key, postures)
+                shapes = shapes or _shapes(robot)
+                meets[key] = _meets(robot, shapes, *key, postures)
             why = _coarse(gap <= 0.0, meets[key])
         if why:
             left_out.setdefault(why, set()).add(f"{spheres[i].frame} / {spheres[j].frame}")
@@ -99,21 +101,26 @@ def _carrier(robot: RobotModel, joint: int) -> str:
     return str(model.frames[model.frames[model.getFrameId(model.names[joint])].parentFrame].name)
 
 
-def _meets(robot: RobotModel, one: frozenset[str], other: frozenset[str], postures: Array) -> NDArray[np.bool_] | None:
-    """Whether geometry of two sets of links meets in the postures (B, nq); None where there is none.
-
-    As for the body's cover it is collision geometry, and visual geometry of links without.
-    """
-    shapes = robot.geometry(pin.GeometryType.COLLISION).copy()
+def _shapes(robot: RobotModel) -> pin.GeometryModel:
+    """As for the body's cover: collision geometry, and visual geometry of links without."""
+    shapes = robot.geometry(pin.GeometryType.COLLISION)
     there = {o.parentFrame for o in shapes.geometryObjects}
     for o in robot.geometry(pin.GeometryType.VISUAL).geometryObjects:
         if o.parentFrame not in there:
             o.name = f"visual {o.name}"
             shapes.addGeometryObject(o)
+    return shapes
+
+
+def _meets(
+    robot: RobotModel, shapes: pin.GeometryModel, one: frozenset[str], other: frozenset[str], postures: Array
+) -> NDArray[np.bool_] | None:
+    """Whether shapes of two sets of links meet in the postures (B, nq); None where there are none."""
     of = {i: robot.model.frames[o.parentFrame].name for i, o in enumerate(shapes.geometryObjects)}
     pairs = [(i, j) for i in of for j in of if of[i] in one and of[j] in other]
     if not pairs:
         return None
+    shapes.removeAllCollisionPairs()
     for pair in pairs:
         shapes.addCollisionPair(pin.CollisionPair(*pair))
     data, scratch = shapes.createData(), robot.model.createData()
