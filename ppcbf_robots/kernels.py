@@ -244,6 +244,18 @@ def _obstacle_row(
     return d, -(n0 * sx + n1 * sy + n2 * sz), second + n0 * gx + n1 * gy + n2 * gz, n0, n1, n2
 
 
+@inlined
+def _self_row(p: Any, vel: Any, acc: Any, a: int, b: int) -> tuple[float, float, float, float, float, float]:
+    """Distance between points a and b, its rate, second order term, and the direction from b to a (base frame)."""
+    x, y, z = p[a, 0] - p[b, 0], p[a, 1] - p[b, 1], p[a, 2] - p[b, 2]
+    d = max(math.sqrt(x * x + y * y + z * z), _TINY)
+    n0, n1, n2 = x / d, y / d, z / d
+    wx, wy, wz = vel[a, 0] - vel[b, 0], vel[a, 1] - vel[b, 1], vel[a, 2] - vel[b, 2]
+    along = n0 * wx + n1 * wy + n2 * wz
+    push = n0 * (acc[a, 0] - acc[b, 0]) + n1 * (acc[a, 1] - acc[b, 1]) + n2 * (acc[a, 2] - acc[b, 2])
+    return d, along, push + (wx * wx + wy * wy + wz * wz - along * along) / d, n0, n1, n2
+
+
 @kernel
 def _pair_rows(
     p: Any, vel: Any, acc: Any, radii: Any, P: int, kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any,
@@ -264,23 +276,34 @@ def _pair_rows(
                 kind, size, planes, first, end, frame, motion, moves,
             )  # fmt: skip
             h[row] = d - radii[i] - margins[o]
-    row = P * O
     for k in range(len(self_pairs)):
-        a, b = self_pairs[k, 0], self_pairs[k, 1]
-        square = along = speed = push = 0.0
-        for r in range(3):
-            n[row, r] = p[a, r] - p[b, r]
-            square += n[row, r] * n[row, r]
-        d = max(math.sqrt(square), _TINY)
-        for r in range(3):
-            n[row, r] /= d
-            w = vel[a, r] - vel[b, r]
-            along += n[row, r] * w
-            speed += w * w
-            push += n[row, r] * (acc[a, r] - acc[b, r])
+        row, a, b = P * O + k, self_pairs[k, 0], self_pairs[k, 1]
+        d, _, curvature[row], n[row, 0], n[row, 1], n[row, 2] = _self_row(p, vel, acc, a, b)
+        h[row], drift[row] = d - radii[a] - radii[b], 0.0
+
+
+@kernel
+def _first_order(
+    p: Any, vel: Any, acc: Any, radii: Any, P: int, kinds: Any, sizes: Any, margins: Any, planes: Any, plane_start: Any,
+    frames: Any, motions: Any, self_pairs: Any, h: Any, hdot: Any,
+) -> None:  # fmt: skip
+    """h and ḣ of :func:`_pair_rows` among obstacles at rest; what is of second order is unused, so it costs nothing."""
+    O = len(kinds)
+    for o in range(O):
+        kind, size, frame, motion = kinds[o], sizes[o], frames[o], motions[o]
+        first, end = plane_start[o], plane_start[o + 1]
+        for i in range(P):
+            row, velocity = i * O + o, (vel[i, 0], vel[i, 1], vel[i, 2])
+            d, _, _, n0, n1, n2 = _obstacle_row(
+                (p[i, 0], p[i, 1], p[i, 2]), velocity, (acc[i, 0], acc[i, 1], acc[i, 2]),
+                kind, size, planes, first, end, frame, motion, False,
+            )  # fmt: skip
+            h[row] = d - radii[i] - margins[o]
+            hdot[row] = n0 * velocity[0] + n1 * velocity[1] + n2 * velocity[2]
+    for k in range(len(self_pairs)):
+        row, a, b = P * O + k, self_pairs[k, 0], self_pairs[k, 1]
+        d, hdot[row], _, _, _, _ = _self_row(p, vel, acc, a, b)
         h[row] = d - radii[a] - radii[b]
-        drift[row], curvature[row] = 0.0, push + (speed - along * along) / d
-        row += 1
 
 
 @kernel
@@ -297,20 +320,6 @@ def _gradient(row: int, n: Any, Jp: Any, P: int, O: int, self_pairs: Any, out: A
         out[j] = 0.0
         for r in range(3):
             out[j] += n[row, r] * (Jp[a, r, j] - Jp[b, r, j])
-
-
-@kernel
-def _closing(row: int, n: Any, vel: Any, P: int, O: int, self_pairs: Any) -> float:
-    """ḣ of a pair's row where obstacles rest."""
-    pairs, hdot = P * O, 0.0
-    if row < pairs:
-        for r in range(3):
-            hdot += n[row, r] * vel[row // O, r]
-        return hdot
-    a, b = self_pairs[row - pairs, 0], self_pairs[row - pairs, 1]
-    for r in range(3):
-        hdot += n[row, r] * (vel[a, r] - vel[b, r])
-    return hdot
 
 
 @kernel
@@ -347,6 +356,16 @@ def rows_at(
 
 
 @kernel
+def _insert(key: float, row: int, keys: Any, rows: Any) -> None:
+    """Put a row where it belongs among those of the least keys, in ascending order; the last one leaves."""
+    at = len(keys) - 1
+    while at > 0 and keys[at - 1] > key:
+        keys[at], rows[at] = keys[at - 1], rows[at - 1]
+        at -= 1
+    keys[at], rows[at] = key, row
+
+
+@kernel
 def nearest_rows_at(
     placements: Any, J: Any, dJ: Any, v: Any, angles: Any, gamma: float, share: Any,
     least: Any, least_rho: Any, h: Any, grad: Any, curvature: Any,
@@ -363,29 +382,39 @@ def nearest_rows_at(
     p, vel, acc = np.empty((points, 3)), np.empty((points, 3)), np.empty((points, 3))
     pairs, rows = P * O + len(self_pairs), P * O + len(self_pairs) + len(limit_joint)
     Jp, n = np.empty((points, 3, nv)), np.empty((pairs, 3))
-    all_h, drift, second, key = np.empty(rows), np.empty(rows), np.empty(rows), np.empty(rows)
-    still = np.zeros(O, dtype=np.bool_)
+    all_h, all_hdot = np.empty(rows), np.empty(rows)
+    keys, nearest = np.empty(count), np.zeros(count, dtype=np.int64)
     for s in range(len(v)):
         point_kinematics(placements[s], J[s], dJ[s], v[s], joints, offsets, mask, p, Jp, vel, acc)
-        _pair_rows(p, vel, acc, radii, P, kinds, sizes, margins, planes, plane_start, frames, motions, still,
-                   self_pairs, all_h, drift, second, n)  # fmt: skip
-        least[s] = least_rho[s] = np.inf
+        _first_order(p, vel, acc, radii, P, kinds, sizes, margins, planes, plane_start, frames, motions,
+                     self_pairs, all_h, all_hdot)  # fmt: skip
+        for k in range(len(limit_joint)):
+            all_h[pairs + k] = limit_sign[k] * (angles[s, limit_joint[k]] - limit_bound[k])
+            all_hdot[pairs + k] = limit_sign[k] * v[s, limit_joint[k]]
+        keys[:] = np.inf
+        least_h = rho = np.inf
         for row in range(rows):
-            if row >= pairs:
-                k = row - pairs
-                all_h[row], second[row] = limit_sign[k] * (angles[s, limit_joint[k]] - limit_bound[k]), 0.0
-                hdot = limit_sign[k] * v[s, limit_joint[k]]
-            else:
-                hdot = _closing(row, n, vel, P, O, self_pairs)
-            least[s] = min(least[s], all_h[row])
-            least_rho[s] = min(least_rho[s], share[s] * hdot + gamma * all_h[row])
-            key[row] = gamma * all_h[row] + min(hdot, 0.0)
+            least_h = min(least_h, all_h[row])
+            rho = min(rho, share[s] * all_hdot[row] + gamma * all_h[row])
+            key = gamma * all_h[row] + min(all_hdot[row], 0.0)
+            if key < keys[count - 1]:
+                _insert(key, row, keys, nearest)
+        least[s], least_rho[s] = least_h, rho
         for at in range(count):
-            row = int(np.argmin(key))
-            key[row] = np.inf
-            h[s, at], curvature[s, at] = all_h[row], second[row]
-            if row < pairs:
-                _gradient(row, n, Jp, P, O, self_pairs, grad[s, at])
-            else:
+            row = nearest[at]
+            h[s, at], curvature[s, at] = all_h[row], 0.0
+            if row >= pairs:
                 grad[s, at, :] = 0.0
                 grad[s, at, limit_joint[row - pairs]] = limit_sign[row - pairs]
+                continue
+            if row < P * O:
+                i = row // O
+                o = row - i * O
+                _, _, curvature[s, at], n[row, 0], n[row, 1], n[row, 2] = _obstacle_row(
+                    (p[i, 0], p[i, 1], p[i, 2]), (vel[i, 0], vel[i, 1], vel[i, 2]), (acc[i, 0], acc[i, 1], acc[i, 2]),
+                    kinds[o], sizes[o], planes, plane_start[o], plane_start[o + 1], frames[o], motions[o], False,
+                )  # fmt: skip
+            else:
+                a, b = self_pairs[row - P * O, 0], self_pairs[row - P * O, 1]
+                _, _, curvature[s, at], n[row, 0], n[row, 1], n[row, 2] = _self_row(p, vel, acc, a, b)
+            _gradient(row, n, Jp, P, O, self_pairs, grad[s, at])

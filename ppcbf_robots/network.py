@@ -32,6 +32,7 @@ from ppcbf_robots import network_kernel
 
 NetworkKind = Literal["mlp", "convex"]
 Params = Mapping[str, Any]
+EVERY = slice(None)
 
 
 def _elu(xp: Any, x: Any) -> tuple[Any, Any]:
@@ -140,21 +141,24 @@ def _convex_units(xp: Any, p: Params, q: Any) -> tuple[Any, Any, Any]:
     return _softplus(xp, x @ p["Wa"] + p["ba"]), x @ p["Wc"] + p["bc"], b
 
 
-def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> Callable[[Any], Any]:
-    """The function ``s -> K(q, s d)`` for many s (...), with everything that depends on q alone done once."""
+def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> Callable[..., Any]:
+    """The function ``s, at -> K(q, s d)`` for many s (...), with everything that depends on q alone done once.
+
+    ``at`` selects the q and d that the s belong to, by default all.
+    """
     p = params
     if kind == "mlp":
         y0 = p["zero_at_rest"] * _mlp_out(xp, p, q, xp.zeros_like(d)) - (1.0 - p["zero_at_rest"]) * p["b_out"]
-        return lambda s: (_mlp_out(xp, p, q, s[..., None] * d) - y0) ** 2
+        return lambda s, at=EVERY: (_mlp_out(xp, p, q[at], s[..., None] * d[at]) - y0[at]) ** 2
     a, c, b = _convex_units(xp, p, q)
     slope = (b * (d * p["v_scale"])[..., None, :]).sum(-1)
     rest, tangent = (a * _softplus(xp, c)).sum(-1), (a * _sigmoid(xp, c) * slope).sum(-1)
     cone, bowl = ((p[f"{form}_b"] * d * p["v_scale"]) ** 2 for form in ("cone", "bowl"))
     cone, bowl = cone.sum(-1), bowl.sum(-1)
 
-    def K(s: Any) -> Any:
-        units = (a * _softplus(xp, s[..., None] * slope + c)).sum(-1) - rest - s * tangent
-        return units + _speed_value(xp, p, s * s * cone, s * s * bowl)[0]
+    def K(s: Any, at: Any = EVERY) -> Any:
+        units = (a[at] * _softplus(xp, s[..., None] * slope[at] + c[at])).sum(-1) - rest[at] - s * tangent[at]
+        return units + _speed_value(xp, p, s * s * cone[at], s * s * bowl[at])[0]
 
     return K
 

@@ -43,8 +43,8 @@ def on_band(problem, network) -> tuple[Problem, Rays, torch.Tensor, BarrierRows]
     """A problem whose closed form acts on phi, rays, s and rows of states on the band."""
     spec = problem.robot.spec.barrier.model_copy(update={"act_within": None})
     field, rays = make_field(problem, network.kind), make_rays(problem, 600)
-    s, crosses = field.on_band(tensors(network.params), rays, torch.full((len(rays),), 0.025, dtype=DOUBLE))
-    rays, s = rays.select(crosses), s[crosses]
+    found, s = field.on_band(tensors(network.params), rays, torch.full((len(rays),), 0.025, dtype=DOUBLE))
+    rays = rays.select(found)
     return problem.with_barrier_spec(spec), rays, s, field.rows(tensors(network.params), rays, s)
 
 

@@ -86,8 +86,7 @@ class Band:
         """Least reserve over the band along every ray (B,), infinite where it has none of it."""
         least = torch.full_like(rays.d[:, 0], torch.inf)
         for level in LEVELS:
-            s, crosses = self.field.on_band(params, rays, torch.full_like(least, self.level(level)), rising=True)
-            found = crosses.nonzero()[:, 0]
+            found, s = self.field.on_band(params, rays, torch.full_like(least, self.level(level)), rising=True)
             if len(found):
-                least[found] = torch.minimum(least[found], self.reserve(params, rays.select(found), s[found]))
+                least[found] = torch.minimum(least[found], self.reserve(params, rays.select(found), s))
         return least

@@ -122,17 +122,17 @@ class Descent(ABC):
 
     def sample(
         self, count: int, pool: torch.Tensor | None = None, params: Tensors | None = None, rising: bool = False
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Band states at random levels of phi on random rays (of ``pool``): ray indices, s, and which rays cross.
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Band states at random levels of phi on ``count`` random rays (of ``pool``): ray indices and s.
 
-        Only the states that cross come back, with the mask (count,) of all; those along whose rays phi rises if asked
-        for. The band is that of ``params``, by default those in training.
+        Only those come back that cross the level, and those along which phi rises through it if asked for. The band is
+        that of ``params``, by default those in training.
         """
         index = torch.randint(len(self.rays) if pool is None else len(pool), (count,), generator=self.generator)
         index = index.to(self.device) if pool is None else pool[index.to(self.device)]
         level = self.band.level(torch.rand(count, generator=self.generator).to(self.device, self.dtype))
-        s, crosses = self.band.field.on_band(params or self.params, self.rays.select(index), level, rising)
-        return index[crosses], s[crosses], crosses
+        found, s = self.band.field.on_band(params or self.params, self.rays.select(index), level, rising)
+        return index[found], s
 
     @torch.no_grad()
     def volume_kept(self) -> float:

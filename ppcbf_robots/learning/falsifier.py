@@ -96,11 +96,10 @@ class Falsifier:
         if len(index):
             rays = Rays(**to_tensors([{k: x[index] for k, x in arrays.items()}], device, dtype))
             level = torch.as_tensor(self.band.level(points[index, -1]), device=device, dtype=dtype)
-            s, crosses = self.band.field.on_band(params, rays, level, rising=True)
-            on = crosses.nonzero()[:, 0]
+            on, s = self.band.field.on_band(params, rays, level, rising=True)
             index, chosen = index[on.cpu().numpy()], rays.select(on)
-            reserve[index] = self.band.reserve(params, chosen, s[on]).cpu().numpy()
-            v[index] = (s[on, None] * chosen.d).cpu().numpy()
+            reserve[index] = self.band.reserve(params, chosen, s).cpu().numpy()
+            v[index] = (s[:, None] * chosen.d).cpu().numpy()
         return reserve, q, v
 
     def start(self, count: int = STARTS) -> Starts:

@@ -92,10 +92,10 @@ class MarginDescent(Descent):
         if not len(self._crossing):
             self.iteration += 1
             return  # the band is empty: the set has collapsed, and the checks will say so
-        index, s, _ = self.sample(count, self._crossing)
+        index, s = self.sample(count, self._crossing)
         drawn = len(index)
         if len(self._near):
-            near, s_near, _ = self.sample(count, self._near, rising=True)
+            near, s_near = self.sample(count, self._near, rising=True)
             index, s = torch.cat([index, near]), torch.cat([s, s_near])
         self.iteration += 1
         if not drawn:
@@ -148,14 +148,14 @@ class MarginDescent(Descent):
         self._join(self._hunted())
         self._look()
         with torch.no_grad():
-            index, s, crosses = self.sample(CHECK_STATES, params=self.judged, rising=True)
+            index, s = self.sample(CHECK_STATES, params=self.judged, rising=True)
             if not len(index):
                 return 0.0, 0.0, 0.0
             rays = self.rays.select(index)
             fails = self.band.margin(self.judged, rays, s) < 0.0
             alone = self.band.margin(self.judged, rays, s, passive=False) < 0.0
             torque = max(float(alone.float().mean()), found, float(attack.worst < 0.0) / CHECK_STATES)
-            return float(crosses.float().mean()), torque, float((fails & ~alone).float().mean())
+            return len(index) / CHECK_STATES, torque, float((fails & ~alone).float().mean())
 
     @torch.no_grad()
     def _look(self) -> None:

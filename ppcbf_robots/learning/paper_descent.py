@@ -37,7 +37,7 @@ class PaperDescent(Descent):
         """Sample, descend for E epochs, drop what left the band, adapt the weights."""
         p, eps = self.preset, self.epsilon
         self.set_rate()
-        index, s, _ = self.sample(p.samples)
+        index, s = self.sample(p.samples)
         index, s = (torch.cat([new, old])[: 2 * p.samples] for new, old in zip((index, s), self.buffer, strict=True))
         for _ in range(p.epochs):
             if not len(index):
@@ -80,12 +80,12 @@ class PaperDescent(Descent):
     @torch.no_grad()
     def check(self) -> tuple[float, float, float]:
         """Shares of the critics above zero, without the training margin."""
-        index, s, crosses = self.sample(CHECK_STATES)
+        index, s = self.sample(CHECK_STATES)
         torque = passivity = 0.0
         if len(index):
             _, t, e = self._critics(self.rays.select(index), s, 0.0)
             torque, passivity = (float((x > limit).float().mean()) for x, limit in ((t, 1e-4), (e, POWER_TOLERANCE)))
-        return float(crosses.float().mean()), torque, passivity
+        return len(index) / CHECK_STATES, torque, passivity
 
     def demand_more(self) -> None:
         """The margin grows."""

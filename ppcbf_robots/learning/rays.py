@@ -16,12 +16,13 @@ import torch
 
 from ppcbf_robots.barriers import BarrierRows, rho_rows
 from ppcbf_robots.learning.threads import in_threads
-from ppcbf_robots.network import NetworkKind, Params, energy_weight, value_along, value_and_grad
+from ppcbf_robots.network import EVERY, NetworkKind, Params, energy_weight, value_along, value_and_grad
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array
 
 RayArrays = dict[str, Array]
+Index = torch.Tensor | slice
 CHUNK = 2000  # configurations evaluated at once, to bound memory
 BISECTIONS = 8  # before the last step, which is a secant
 FAR = 5.0  # [m/s], rho above which a row cannot matter
@@ -57,7 +58,7 @@ class Rays:
             **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in dataclasses.fields(self)}
         )
 
-    def select(self, index: torch.Tensor | slice) -> Rays:
+    def select(self, index: Index) -> Rays:
         """Some of the rays."""
         return Rays(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
 
@@ -91,11 +92,11 @@ class Field:
         work = s * s * (v * rays.beta).sum(-1)  # ½ vᵀ Ṁ v = vᵀ C v
         return K + 0.5 * energy * (v * Mv).sum(-1), K_q_rate + energy * work, K_v + energy * Mv
 
-    def K_along(self, params: Params, rays: Rays) -> Callable[[torch.Tensor], torch.Tensor]:
-        """The function ``s -> K(q, s d)`` of all rays."""
+    def K_along(self, params: Params, rays: Rays) -> Callable[..., torch.Tensor]:
+        """The function ``s, at -> K(q, s d)`` of the rays ``at`` some indices, by default of all."""
         K = value_along(torch, self.kind, params, rays.q, rays.d)
         full = 0.5 * energy_weight(torch, params) * (rays.d * rays.Md).sum(-1)
-        return lambda s: K(s) + s * s * full
+        return lambda s, at=EVERY: K(s, at) + s * s * full[at]
 
     def K_of(self, params: Params, states: VolumeStates) -> torch.Tensor:
         """K (B,)."""
@@ -126,35 +127,31 @@ class Field:
     def on_band(
         self, params: Params, rays: Rays, level: torch.Tensor, rising: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """s with ``min_k phi_k(s) = level`` by bisection, and which rays cross that level at all.
+        """Indices (N,) of the rays that cross a level (B,) of ``min_k phi_k``, and s (N,) where, by bisection.
 
         They fall through it on the way out; with ``rising`` also those count that are below it at rest, closer than
         ``level / gamma``, and end above it, as where an arm leaves an obstacle.
         """
-        hdot = (rays.grad * rays.d[:, None, :]).sum(-1)
+        hdot, gap = (rays.grad * rays.d[:, None, :]).sum(-1), self.gamma * rays.h
         K = self.K_along(params, rays)
 
-        def excess(s: torch.Tensor) -> torch.Tensor:
-            rho: torch.Tensor = (s[:, None] * hdot + self.gamma * rays.h).amin(-1)
-            value: torch.Tensor = K(s)
-            return rho - value - level
+        def excess(s: torch.Tensor, at: Index = EVERY) -> torch.Tensor:
+            rho: torch.Tensor = (s[:, None] * hdot[at] + gap[at]).amin(-1)
+            return rho - K(s, at) - level[at]
 
-        low, high = torch.zeros_like(level), torch.ones_like(level)
-        at_low, at_high = excess(low), excess(high)
-        crosses = (at_low >= 0.0) & (at_high < 0.0)
-        sign = torch.ones_like(level)
-        if rising:
-            rises = (at_low < 0.0) & (at_high >= 0.0)
-            crosses, sign = crosses | rises, torch.where(rises, -1.0, 1.0)
-        at_low, at_high = sign * at_low, sign * at_high
+        at_low, at_high = excess(torch.zeros_like(level)), excess(torch.ones_like(level))
+        falls, rises = (at_low >= 0.0) & (at_high < 0.0), (at_low < 0.0) & (at_high >= 0.0)
+        found = ((falls | rises) if rising else falls).nonzero()[:, 0]
+        sign = torch.where(rises[found], -1.0, 1.0)
+        low, high = torch.zeros_like(level[found]), torch.ones_like(level[found])
+        at_low, at_high = sign * at_low[found], sign * at_high[found]
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            value = sign * excess(middle)
+            value = sign * excess(middle, found)
             ok = value >= 0.0
             low, at_low = torch.where(ok, middle, low), torch.where(ok, value, at_low)
             high, at_high = torch.where(ok, high, middle), torch.where(ok, at_high, value)
-        secant = low + (high - low) * at_low / (at_low - at_high).clamp(min=1e-9)
-        return torch.where(crosses, secant, low), crosses
+        return found, low + (high - low) * at_low / (at_low - at_high).clamp(min=1e-9)
 
 
 def build_pool(
