@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from ppcbf_robots import network_kernel
 
 NetworkKind = Literal["mlp", "convex"]
 Params = Mapping[str, Any]
-EVERY = slice(None)
 
 
 def _elu(xp: Any, x: Any) -> tuple[Any, Any]:
@@ -117,16 +116,31 @@ def _convex(xp: Any, p: Params, q: Any, v: Any) -> tuple[Any, Any, Any]:
 def _speed_terms(xp: Any, p: Params, s: Any) -> tuple[Any, Any]:
     """F + G (...) of the scaled velocity s (..., nv) and their gradient (..., nv)."""
     cone_square, bowl_square = p["cone_b"] * p["cone_b"], p["bowl_b"] * p["bowl_b"]
-    value, by_cone, by_bowl = _speed_value(xp, p, (cone_square * s * s).sum(-1), (bowl_square * s * s).sum(-1))
+    shape = _speed_shape(xp, p)
+    value, root, z = _speed_value(xp, shape, (cone_square * s * s).sum(-1), (bowl_square * s * s).sum(-1))
+    by_cone, by_bowl = shape.cone_a / root, 2.0 * shape.bowl_a * _sigmoid(xp, z)  # by |s|², twice
     return value, (by_cone[..., None] * cone_square + by_bowl[..., None] * bowl_square) * s
 
 
-def _speed_value(xp: Any, p: Params, cone: Any, bowl: Any) -> tuple[Any, Any, Any]:
-    """F + G (...) of the squared lengths |s|² (...) that each sees, and twice its derivatives with respect to these."""
+class _SpeedShape(NamedTuple):
+    """What F and G have besides their weights b, all of it positive but ``bowl_c``."""
+
+    cone_a: Any
+    cone_c: Any
+    bowl_a: Any
+    bowl_c: Any
+    bowl_rest: Any  # softplus(-bowl_c)
+
+
+def _speed_shape(xp: Any, p: Params) -> _SpeedShape:
     cone_a, cone_c, bowl_a = _softplus(xp, p["cone_a"]), _softplus(xp, p["cone_c"]), _softplus(xp, p["bowl_a"])
-    root, z = xp.sqrt(cone + cone_c * cone_c), bowl - p["bowl_c"]
-    value = cone_a * (root - cone_c) + bowl_a * (_softplus(xp, z) - _softplus(xp, -p["bowl_c"]))
-    return value, cone_a / root, 2.0 * bowl_a * _sigmoid(xp, z)
+    return _SpeedShape(cone_a, cone_c, bowl_a, p["bowl_c"], _softplus(xp, -p["bowl_c"]))
+
+
+def _speed_value(xp: Any, shape: _SpeedShape, cone: Any, bowl: Any) -> tuple[Any, Any, Any]:
+    """F + G (...) of the squared lengths |s|² (...) that each sees, the root of F and the argument of G's softplus."""
+    root, z = xp.sqrt(cone + shape.cone_c * shape.cone_c), bowl - shape.bowl_c
+    return shape.cone_a * (root - shape.cone_c) + shape.bowl_a * (_softplus(xp, z) - shape.bowl_rest), root, z
 
 
 def _mlp_out(xp: Any, p: Params, q: Any, v: Any) -> Any:
@@ -141,26 +155,48 @@ def _convex_units(xp: Any, p: Params, q: Any) -> tuple[Any, Any, Any]:
     return _softplus(xp, x @ p["Wa"] + p["ba"]), x @ p["Wc"] + p["bc"], b
 
 
-def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> Callable[..., Any]:
-    """The function ``s, at -> K(q, s d)`` for many s (...), with everything that depends on q alone done once.
+class Along:
+    """The function ``s -> K(q, s d)`` along many rays (...), with everything that depends on q and d alone done once.
 
-    ``at`` selects the q and d that the s belong to, by default all.
+    Args:
+        of: of s (...) and ``terms``.
+        terms: of every ray, each (..., any).
     """
+
+    def __init__(self, of: Callable[..., Any], *terms: Any) -> None:
+        self._of, self._terms = of, terms
+
+    def __call__(self, s: Any) -> Any:
+        """K (...) at s (...)."""
+        return self._of(s, *self._terms)
+
+    def select(self, index: Any) -> Along:
+        """The function along some of the rays."""
+        return Along(self._of, *(x[index] for x in self._terms))
+
+    def plus(self, square: Any) -> Along:
+        """The function with ``s² square`` (...) added."""
+        of = self._of
+        return Along(lambda s, square, *terms: of(s, *terms) + s * s * square, square, *self._terms)
+
+
+def value_along(xp: Any, kind: NetworkKind, params: Params, q: Any, d: Any) -> Along:
+    """K, without energy, along the rays through rest in q (..., nq) of direction d (..., nv)."""
     p = params
     if kind == "mlp":
         y0 = p["zero_at_rest"] * _mlp_out(xp, p, q, xp.zeros_like(d)) - (1.0 - p["zero_at_rest"]) * p["b_out"]
-        return lambda s, at=EVERY: (_mlp_out(xp, p, q[at], s[..., None] * d[at]) - y0[at]) ** 2
+        return Along(lambda s, q, d, y0: (_mlp_out(xp, p, q, s[..., None] * d) - y0) ** 2, q, d, y0)
     a, c, b = _convex_units(xp, p, q)
     slope = (b * (d * p["v_scale"])[..., None, :]).sum(-1)
     rest, tangent = (a * _softplus(xp, c)).sum(-1), (a * _sigmoid(xp, c) * slope).sum(-1)
     cone, bowl = ((p[f"{form}_b"] * d * p["v_scale"]) ** 2 for form in ("cone", "bowl"))
-    cone, bowl = cone.sum(-1), bowl.sum(-1)
+    shape = _speed_shape(xp, p)
 
-    def K(s: Any, at: Any = EVERY) -> Any:
-        units = (a[at] * _softplus(xp, s[..., None] * slope[at] + c[at])).sum(-1) - rest[at] - s * tangent[at]
-        return units + _speed_value(xp, p, s * s * cone[at], s * s * bowl[at])[0]
+    def K(s: Any, a: Any, c: Any, slope: Any, rest: Any, tangent: Any, cone: Any, bowl: Any) -> Any:
+        units = (a * _softplus(xp, s[..., None] * slope + c)).sum(-1) - rest - s * tangent
+        return units + _speed_value(xp, shape, s * s * cone, s * s * bowl)[0]
 
-    return K
+    return Along(K, a, c, slope, rest, tangent, cone.sum(-1), bowl.sum(-1))
 
 
 def energy_weight(xp: Any, params: Params) -> Any:

@@ -66,7 +66,7 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
     """Continue from a folder's checkpoint.
 
     Raises:
-        InputError: if there is none, or it belongs to another version, problem, preset or seed.
+        InputError: if there is none, or it belongs to another version, problem, preset, seed or device.
     """
     path = folder / FILE
     if not path.is_file():
@@ -81,7 +81,7 @@ def load_checkpoint(trainer: Trainer, folder: Path) -> None:
         raise InputError(f"{path}: a checkpoint of another version; {AGAIN}")
     if state["identity"] != trainer.identity():
         raise InputError(
-            f"{path}: belongs to another robot, world, preset, barrier or seed; resume with the same options"
+            f"{path}: belongs to another robot, world, preset, barrier, seed or device; resume with the same options"
         )
     descent = trainer.descent
     if any(getattr(tensors.get(f"param/{k}"), "shape", None) != x.shape for k, x in descent.params.items()):

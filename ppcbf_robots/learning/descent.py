@@ -41,11 +41,13 @@ class Descent(ABC):
     def __init__(self, problem: Problem, kind: LearnedKind, preset: Preset, seed: int, device: str) -> None:
         self.problem, self.kind, self.preset = problem, kind, preset
         self.device, self.dtype = torch.device(device), torch.float32
-        self.generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)  # of the first parameters, equal on every device
+        on_cpu = self.device.type == "cpu"
+        self.generator = generator if on_cpu else torch.Generator(self.device).manual_seed(seed)
         self.rng = np.random.default_rng(seed)
         self.filter_config = FilterConfig(kind=preset.filter, metric=preset.metric)
         self.rays, self.volume = self._pool()
-        params = initial_parameters(problem, preset, float(self.volume.energy.mean()), self.generator)
+        params = initial_parameters(problem, preset, float(self.volume.energy.mean()), generator)
         self.params: Tensors = {k: x.to(self.device, self.dtype) for k, x in params.items()}
         self.judged: Tensors = self.params  # what checks and evidence look at
         self.trained = [k for k in self.params if k not in CONSTANTS]
@@ -128,9 +130,10 @@ class Descent(ABC):
         Only those come back that cross the level, and those along which phi rises through it if asked for. The band is
         that of ``params``, by default those in training.
         """
-        index = torch.randint(len(self.rays) if pool is None else len(pool), (count,), generator=self.generator)
-        index = index.to(self.device) if pool is None else pool[index.to(self.device)]
-        level = self.band.level(torch.rand(count, generator=self.generator).to(self.device, self.dtype))
+        rays, generator, device = len(self.rays) if pool is None else len(pool), self.generator, self.device
+        index = torch.randint(rays, (count,), generator=generator, device=device)  # nothing comes from the CPU
+        index = index if pool is None else pool[index]
+        level = self.band.level(torch.rand(count, generator=generator, device=device, dtype=self.dtype))
         found, s = self.band.field.on_band(params or self.params, self.rays.select(index), level, rising)
         return index[found], s
 

@@ -181,7 +181,7 @@ class MarginDescent(Descent):
         """New rays about those of least reserve, and where joints run into bounds; the share of them that violate."""
         near, count = self._near, EXPLORED // 4
         chosen = (
-            near[torch.randint(len(near), (count // 2,), generator=self.generator).to(self.device)]
+            near[torch.randint(len(near), (count // 2,), generator=self.generator, device=self.device)]
             if len(near)
             else near
         )

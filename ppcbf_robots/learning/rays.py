@@ -7,7 +7,6 @@ another call of Pinocchio, and bisection in s lands on any level of phi.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ import torch
 
 from ppcbf_robots.barriers import BarrierRows, rho_rows
 from ppcbf_robots.learning.threads import in_threads
-from ppcbf_robots.network import EVERY, NetworkKind, Params, energy_weight, value_along, value_and_grad
+from ppcbf_robots.network import Along, NetworkKind, Params, energy_weight, value_along, value_and_grad
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array
@@ -92,11 +91,10 @@ class Field:
         work = s * s * (v * rays.beta).sum(-1)  # ½ vᵀ Ṁ v = vᵀ C v
         return K + 0.5 * energy * (v * Mv).sum(-1), K_q_rate + energy * work, K_v + energy * Mv
 
-    def K_along(self, params: Params, rays: Rays) -> Callable[..., torch.Tensor]:
-        """The function ``s, at -> K(q, s d)`` of the rays ``at`` some indices, by default of all."""
-        K = value_along(torch, self.kind, params, rays.q, rays.d)
+    def K_along(self, params: Params, rays: Rays) -> Along:
+        """The function ``s -> K(q, s d)`` of all rays."""
         full = 0.5 * energy_weight(torch, params) * (rays.d * rays.Md).sum(-1)
-        return lambda s, at=EVERY: K(s, at) + s * s * full[at]
+        return value_along(torch, self.kind, params, rays.q, rays.d).plus(full)
 
     def K_of(self, params: Params, states: VolumeStates) -> torch.Tensor:
         """K (B,)."""
@@ -135,19 +133,20 @@ class Field:
         hdot, gap = (rays.grad * rays.d[:, None, :]).sum(-1), self.gamma * rays.h
         K = self.K_along(params, rays)
 
-        def excess(s: torch.Tensor, at: Index = EVERY) -> torch.Tensor:
-            rho: torch.Tensor = (s[:, None] * hdot[at] + gap[at]).amin(-1)
-            return rho - K(s, at) - level[at]
+        def excess(s: torch.Tensor) -> torch.Tensor:
+            value: torch.Tensor = (s[:, None] * hdot + gap).amin(-1) - K(s) - level
+            return value
 
         at_low, at_high = excess(torch.zeros_like(level)), excess(torch.ones_like(level))
         falls, rises = (at_low >= 0.0) & (at_high < 0.0), (at_low < 0.0) & (at_high >= 0.0)
         found = ((falls | rises) if rising else falls).nonzero()[:, 0]
+        hdot, gap, level, K = hdot[found], gap[found], level[found], K.select(found)
         sign = torch.where(rises[found], -1.0, 1.0)
-        low, high = torch.zeros_like(level[found]), torch.ones_like(level[found])
+        low, high = torch.zeros_like(level), torch.ones_like(level)
         at_low, at_high = sign * at_low[found], sign * at_high[found]
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            value = sign * excess(middle, found)
+            value = sign * excess(middle)
             ok = value >= 0.0
             low, at_low = torch.where(ok, middle, low), torch.where(ok, value, at_low)
             high, at_high = torch.where(ok, high, middle), torch.where(ok, at_high, value)

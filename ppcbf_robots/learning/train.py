@@ -134,7 +134,7 @@ class Trainer:
         """What a checkpoint must share with this run to be resumed."""
         spec = self.problem.robot.spec.barrier
         problem = [self.problem.fingerprint(), self.problem.robot.goal.tolist(), spec.model_dump()]
-        return json.dumps([*problem, self.kind, settings(self.preset), self.seed])
+        return json.dumps([*problem, self.kind, settings(self.preset), self.seed, self.descent.device.type])
 
     def run(
         self,
