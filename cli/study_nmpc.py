@@ -11,12 +11,13 @@ import typer
 
 from ppcbf_robots.cli.extras import needs
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
-from ppcbf_robots.cli.study_safe_set import LB, PP, NodesOption, ViableOption, trained, viable_set, write_csv
-from ppcbf_robots.cli.tasks import DaskOption, JobsOption, OutOption, run_tasks
-from ppcbf_robots.errors import CheckFailed, InputError
+from ppcbf_robots.cli.study_safe_set import NodesOption, ViableOption, viable_set, write_csv
+from ppcbf_robots.cli.tasks import DaskOption, JobsOption, OutOption, all_results, run_tasks
+from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
 from ppcbf_robots.resources import portable
 from ppcbf_robots.safe_sets import Mask, levels_at
+from ppcbf_robots.set_tasks import known_barriers
 from ppcbf_robots.specs import Array, vector
 from ppcbf_robots.sweep import Task
 
@@ -55,14 +56,10 @@ def nmpc(
     from ppcbf_robots.plots_study import plot_nmpc, slice_states  # matplotlib only where it is needed
 
     q = slice_states(problem, x, y)
-    barriers = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")} | trained(problem, barrier or [])
+    barriers = known_barriers(problem, [Path(folder) for folder in barrier or []])
     tasks = planning_tasks(problem, (robot, obstacles), (steps, dt, iterations), problem.model.to_angles(q), v)
     reference = viable_set(problem, nodes) if viable and problem.model.nv == 2 else None
-    records = run_tasks(tasks, out_dir, jobs, dask, "plans")
-    failed = [record["error"] for record in records if "error" in record]
-    if failed:
-        raise CheckFailed(f"{len(failed)} of {len(records)} plans ended with an error; the first: {failed[0]}")
-    points = [record["result"] for record in records]
+    points = all_results(run_tasks(tasks, out_dir, jobs, dask, "plans"), "plans")
     found = np.array([p["safe"] for p in points])
     levels = levels_at(problem, barriers, reference, q, np.tile(v, (len(q), 1)))
     sets = {name: level >= 0.0 for name, level in levels.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,17 +12,17 @@ import numpy as np
 import typer
 from rich.progress import Progress
 
-from ppcbf_robots.artefact import load_barrier
-from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.cli.extras import needs
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, table
+from ppcbf_robots.cli.tasks import DaskOption, JobsOption, OutOption, all_results, run_tasks
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.problem import Problem, load_problem, parse_vector
-from ppcbf_robots.safe_sets import FREE, VIABLE, Membership, check_boundary, membership
+from ppcbf_robots.problem import Problem, parse_vector
+from ppcbf_robots.resources import portable
+from ppcbf_robots.safe_sets import FREE, VIABLE, BoundaryCheck, Membership
+from ppcbf_robots.set_tasks import LB, PP, SetsJob, boundary_tasks, counted, volume_tasks
 from ppcbf_robots.specs import Array, vector
 from ppcbf_robots.viable_set import ViableSet
 
-LB, PP = "LB-CBF", "PP-CBF"
 NodesOption = Annotated[int, typer.Option(min=7, max=101, help="Nodes per axis of the viable set's grid.")]
 ViableOption = Annotated[bool, typer.Option(help="The viable set too, where the robot has 2 joints.")]
 
@@ -29,7 +30,7 @@ ViableOption = Annotated[bool, typer.Option(help="The viable set too, where the 
 def safe_set(
     robot: RobotArgument,
     obstacles: WorldArgument,
-    out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for figure and table.")],
+    out_dir: OutOption,
     barrier: Annotated[list[str] | None, typer.Option(metavar="DIR", help="Trained barrier; may be repeated.")] = None,
     velocity: Annotated[
         list[str] | None, typer.Option(metavar="V,...", help="Velocity of a slice; may be repeated.")
@@ -39,26 +40,34 @@ def safe_set(
     viable: ViableOption = True,
     nodes: NodesOption = 41,
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1)] = 0,
+    jobs: JobsOption = 1,
+    dask: DaskOption = None,
     json: JsonOption = False,
 ) -> None:
     """Volumes and slices of the safe sets of LB-CBF, PP-CBF, trained barriers and the viable set (Fig. 7 of the paper).
 
     Volumes are shares of the same uniform states of X. "Not viable" is the share of a set from which no torque within
     the limits avoids a collision; "infeasible" the share of states at a set's boundary where no torque within the
-    limits satisfies its rows. The PP-CBF's set is a reference only where it is feasible.
+    limits satisfies its rows. The PP-CBF's set is a reference only where it is feasible. The same command goes on after
+    an interrupt.
 
     Example: ppcbf study safe-set cartpole wall --barrier runs/cartpole --out runs/sets
     """
-    problem = load_problem(robot, obstacles)
+    folders = tuple(Path(folder).resolve() for folder in barrier or [])
+    job = SetsJob(portable(robot), portable(obstacles), folders, None, seed)
+    problem, barriers = job.load()
     velocities = _velocities(problem, velocity)
-    barriers = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")} | trained(problem, barrier or [])
     reference = viable_set(problem, nodes) if viable and problem.model.nv == 2 else None
-    rng = np.random.default_rng(seed)
-    found = membership(problem, barriers, reference, samples, rng)
-    rows = [_row(found, name) for name in found.inside]
+    if reference is not None:
+        job = dataclasses.replace(job, viable=(reference.nodes, reference.loss, reference.sweeps))
+    about = job.about(problem)
+    volumes, boundaries = volume_tasks(job, about, samples), boundary_tasks(job, about, list(barriers), boundary)
+    results = all_results(run_tasks([*volumes, *boundaries], out_dir, jobs, dask, "states"), "tasks")
+    found = counted(results[: len(volumes)])
+    checks = {name: BoundaryCheck(**r) for name, r in zip(barriers, results[len(volumes) :], strict=True)}
+    rows = [_row(found, name) for name in found.names]
     for row in rows:
-        known = barriers.get(row["set"])
-        check = None if known is None else check_boundary(problem, known, boundary, rng)
+        check = checks.get(row["set"])
         row |= {"infeasible": None if check is None else check.share, "boundary": 0 if check is None else check.samples}
     if any(row["set"] == PP and row["infeasible"] for row in rows):  # a set that no filter can keep is no measure
         rows = [row | {"of_pp": None, "of_pp_error": None} for row in rows]
@@ -75,17 +84,6 @@ def safe_set(
     else:
         _print(problem, rows)
         out.print("wrote " + ", ".join(files))
-
-
-def trained(problem: Problem, folders: list[str]) -> dict[str, Barrier]:
-    """Trained barriers by the names of their folders, refused where they belong to another problem."""
-    found: dict[str, Barrier] = {}
-    for folder in folders:
-        name = Path(folder).name
-        if name in found:
-            raise InputError(f"--barrier: two folders are named '{name}'; rename one")
-        found[name] = load_barrier(Path(folder)).barrier(problem)
-    return found
 
 
 def viable_set(problem: Problem, nodes: int) -> ViableSet:
@@ -116,10 +114,10 @@ def _row(found: Membership, name: str) -> dict[str, Any]:
     """Volume of a set relative to X and the references, each with its standard error."""
     row: dict[str, Any] = {"set": name}
     for key, reference in (("of_X", None), ("of_lb", LB), ("of_pp", PP), ("of_viable", VIABLE)):
-        known = reference is None or reference in found.inside
+        known = reference is None or reference in found.names
         ratio = found.ratio(name, reference) if known else None
         row |= {key: ratio and ratio.value, f"{key}_error": ratio and ratio.error}
-    row["not_viable"] = found.outside(name, VIABLE) if VIABLE in found.inside and name not in (FREE, VIABLE) else None
+    row["not_viable"] = found.outside(name, VIABLE) if VIABLE in found.names and name not in (FREE, VIABLE) else None
     return row
 
 

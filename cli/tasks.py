@@ -76,6 +76,14 @@ def ended(records: Sequence[Record]) -> list[Record]:
     return found
 
 
+def all_results(records: Sequence[Record], what: str) -> list[Any]:
+    """The results of all records; CheckFailed if one has none."""
+    failed = [record["error"] for record in records if "error" in record]
+    if failed:
+        raise CheckFailed(f"{len(failed)} of {len(records)} {what} ended with an error; the first: {failed[0]}")
+    return [record["result"] for record in records]
+
+
 def show_study(title: str, rows: Sequence[Row], files: Sequence[Path], json: bool, records: Sequence[Record]) -> None:
     """The result of a study on stdout; CheckFailed afterwards if some of its records hold an error."""
     if json:

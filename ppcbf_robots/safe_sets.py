@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -31,23 +32,40 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Membership:
-    """Which of the same uniform states of X lie in which set."""
+    """How many of the same uniform states of X lie in which sets."""
 
-    inside: dict[str, Mask]  # (samples,) by name; FREE, VIABLE if it is known, and the barriers' sets
+    names: tuple[str, ...]  # FREE, VIABLE if it is known, and the barriers' sets
+    samples: int
+    both: NDArray[np.int64]  # (sets, sets): states in the one and the other; on the diagonal, in the one
+
+    @classmethod
+    def of(cls, inside: Mapping[str, Mask]) -> Membership:
+        """Counts of masks (samples,) by name."""
+        masks = np.array(list(inside.values()), dtype=np.int64)
+        return cls(tuple(inside), masks.shape[1], masks @ masks.T)
+
+    def __add__(self, other: Membership) -> Membership:
+        """With other states counted too."""
+        assert self.names == other.names
+        return Membership(self.names, self.samples + other.samples, self.both + other.both)
 
     def ratio(self, name: str, reference: str | None = None) -> Ratio:
         """Volume of a set over that of a reference, None for X itself; NaN where the reference is empty."""
-        a = self.inside[name].astype(float)
-        b = np.ones_like(a) if reference is None else self.inside[reference].astype(float)
-        if not b.any():
+        i = self.names.index(name)
+        a = shared = float(self.both[i, i])
+        b = float(self.samples)
+        if reference is not None:
+            j = self.names.index(reference)
+            b, shared = float(self.both[j, j]), float(self.both[i, j])
+        if not b:
             return Ratio(float("nan"), float("nan"))
-        value = a.sum() / b.sum()
-        return Ratio(float(value), float(np.sqrt(np.sum((a - value * b) ** 2)) / b.sum()))
+        value = a / b
+        return Ratio(value, math.sqrt(max(a - 2.0 * value * shared + value * value * b, 0.0)) / b)
 
     def outside(self, name: str, reference: str) -> float:
         """Share of a set that lies outside a reference; NaN where the set is empty."""
-        mine = self.inside[name]
-        return float(np.mean(~self.inside[reference][mine])) if mine.any() else float("nan")
+        i, j = self.names.index(name), self.names.index(reference)
+        return float(1.0 - self.both[i, j] / self.both[i, i]) if self.both[i, i] else float("nan")
 
 
 def membership(
@@ -62,7 +80,7 @@ def membership(
     for n in _chunks(count):
         q = problem.model.from_angles(domain.sample_q(rng, n))
         parts.append(levels_at(problem, barriers, viable, q, domain.sample_v(rng, n)))
-    return Membership({name: np.concatenate([part[name] for part in parts]) >= 0.0 for name in parts[0]})
+    return Membership.of({name: np.concatenate([part[name] for part in parts]) >= 0.0 for name in parts[0]})
 
 
 def levels_at(

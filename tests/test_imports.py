@@ -35,7 +35,7 @@ LAYERS = [
     ["benchmark", "viability", "safe_sets", "nmpc", "faults", "band_statistics", "proof"],
     ["fault_cases", "artefact_faults"],
     ["learning"],
-    ["band_tasks"],
+    ["band_tasks", "set_tasks"],
     ["export", "export_c", "plots", "plots_study", "viewer", "viewer_page", "viewer_shapes"],
     ["studies"],
     ["report", "report_page", "report_parts"],

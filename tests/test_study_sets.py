@@ -59,6 +59,26 @@ def test_safe_set_without_a_viable_set(tmp_path, panda):
     assert facts["rows"][2]["infeasible"] == 0.0 and facts["rows"][2]["of_pp"] == 1.0
 
 
+def test_safe_set_is_counted_in_pieces_by_many_processes(tmp_path):
+    """What is in the file is not counted again, and the pieces add up to the same sets however many there are."""
+    arguments = ("safe-set", GANTRY, "wall", "--out", str(tmp_path), "--samples", "11000", "--boundary", "20",
+                 "--nodes", "9", "--jobs", "2")  # fmt: skip
+    first = run(*arguments)
+    lines = (tmp_path / "results.jsonl").read_text().splitlines()
+    records = [json.loads(line) for line in lines]
+    pieces = {r["key"]["chunk"]: r["result"] for r in records if "chunk" in r["key"]}
+    assert sorted(r["samples"] for r in pieces.values()) == [1000, 5000, 5000]
+    assert pieces[0]["both"] != pieces[1]["both"]
+    lb = pieces[0]["names"].index("LB-CBF")
+    total = sum(r["both"][lb][lb] for r in pieces.values())
+    assert {row["set"]: row["of_X"] for row in first["rows"]}["LB-CBF"] == total / 11_000
+    done = [line for line in lines if '"chunk": 1' not in line]
+    (tmp_path / "results.jsonl").write_text("".join(f"{line}\n" for line in done))
+    assert run(*arguments) == first
+    again = (tmp_path / "results.jsonl").read_text().splitlines()
+    assert again[:-1] == done and json.loads(again[-1])["result"] == pieces[1]
+
+
 def test_bad_input_of_safe_set(tmp_path):
     out = ["--out", str(tmp_path)]
     assert "not a barrier folder" in refused("safe-set", GANTRY, "wall", "--barrier", str(tmp_path), *out)

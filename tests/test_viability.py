@@ -176,11 +176,11 @@ def test_ratios_and_their_standard_error():
     for _ in range(300):
         b = rng.random(1000) < 0.5
         a = b & (rng.random(1000) < p)
-        estimates.append(Membership({"a": a, "b": b}).ratio("a", "b"))
+        estimates.append(Membership.of({"a": a, "b": b}).ratio("a", "b"))
     values = np.array([e.value for e in estimates])
     assert values.mean() == pytest.approx(p, abs=0.005)
     assert values.std() == pytest.approx(np.mean([e.error for e in estimates]), rel=0.15)
-    empty = Membership({"a": np.zeros(3, bool), "b": np.ones(3, bool)})
+    empty = Membership.of({"a": np.zeros(3, bool), "b": np.ones(3, bool)})
     assert empty.ratio("a", "b").value == 0.0 and np.isnan(empty.ratio("b", "a").value)
     assert np.isnan(empty.outside("a", "b")) and empty.outside("b", "a") == 1.0
 
