@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -172,6 +172,8 @@ _Loader.add_implicit_resolver(
 SHAPES = ("sphere", "half_space", "box", "capsule", "cylinder", "mesh")  # of obstacles, also in pydantic's locations
 S = TypeVar("S", bound=Spec)
 MAX_SPEC_BYTES = 4_000_000
+LARGEST = 1e12  # whatever the unit; beyond, squares and products soon overflow
+_XML_ENCODING = re.compile(rb"""<\?xml[^>]*\sencoding=["']([A-Za-z][A-Za-z0-9._-]*)["']""")
 
 
 def read_text(path: Path, what: str) -> str:
@@ -181,15 +183,22 @@ def read_text(path: Path, what: str) -> str:
             raise InputError(f"{path} is a pipe or a device; give the path of a {what}")
         if path.stat().st_size > MAX_SPEC_BYTES * 10:
             raise InputError(f"{path}: larger than {MAX_SPEC_BYTES * 10 // 10**6} MB, which no {what} is")
-        return path.read_text(encoding="utf-8")
+        return _decoded(path.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{what} not found: {path}") from None
     except IsADirectoryError:
         raise InputError(f"{path} is a folder; give the path of a {what}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file in UTF-8") from None
+    except (UnicodeDecodeError, LookupError):
+        raise InputError(f"{path}: not a text file in UTF-8, nor in what its first line declares") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _decoded(content: bytes) -> str:
+    """Text with the line ends of this machine's; XML may say how it is encoded, all else is UTF-8."""
+    declared = _XML_ENCODING.match(content)
+    text = content.decode(declared[1].decode() if declared else "utf-8")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def load_spec(path: Path, kind: type[S], what: str) -> S:
@@ -225,9 +234,24 @@ def read_mapping(path: Path, what: str, keys: Sequence[str]) -> dict[str, Any]:
 def validate(data: dict[str, Any], kind: type[S], where: str) -> S:
     """Validated spec from plain data; raises InputError with the first problem in words."""
     try:
-        return kind.model_validate(data)
+        spec = kind.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{where}: {_first_problem(error, kind)}") from None
+    for key, number in _numbers(spec.model_dump()):
+        if abs(number) > LARGEST:
+            raise InputError(
+                f"{where}: {key}: {number:g} is no quantity of a robot; the largest allowed is {LARGEST:g}"
+            )
+    return spec
+
+
+def _numbers(data: Any, key: str = "") -> Iterator[tuple[str, float]]:
+    """All numbers of plain data, with their keys."""
+    if isinstance(data, float | int):
+        yield key, data
+    parts = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list | tuple) else ()
+    for name, part in parts:
+        yield from _numbers(part, f"{key}.{name}" if key else str(name))
 
 
 def _first_problem(error: ValidationError, kind: type[Spec]) -> str:

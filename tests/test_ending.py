@@ -45,6 +45,8 @@ def test_motion_is_told_with_its_direction_and_the_time_left(two_link):
     assert (end.speed, end.approach, end.power) == pytest.approx((0.1, 0.1, 0.5))
     assert end.remaining == pytest.approx((0.65 - 0.05) / 0.1)
     assert "towards the goal" in end.text() and end.text().endswith("run 6 s longer (--duration) at this rate")
+    near = judged(two_link, 0.27 - 0.1 * t, V=3.0 - 0.5 * t)
+    assert near.remaining == pytest.approx(0.2) and "run 1 s longer" in near.text()
     away = judged(two_link, 0.65 + 0.1 * t, "tip#0 / circle", V=3.0 - 0.5 * t)
     assert away.remaining is None and "moving along tip#0 / circle, away from the goal" in away.text()
     swinging = judged(two_link, 0.5 + 0.1 * np.sin(20.0 * t))

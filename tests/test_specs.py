@@ -452,6 +452,27 @@ def test_bad_numbers_of_an_option():
     assert message(parse_vector, "1,x", "--start") == "--start: expected numbers separated by commas, got '1,x'"
 
 
+def test_a_number_that_no_robot_has_is_refused(files):
+    """Beyond, products overflow and what is derived of it is not a number."""
+    path = files(robot=changed(ROBOT, "5e-2", "1e300")) / "arm.yaml"
+    assert "1e+300 is no quantity of a robot; the largest allowed is 1e+12" in message(load_robot, str(path))
+    path = files(robot=ROBOT + "locked: {nothing: -2e12}\n") / "arm.yaml"
+    assert message(load_robot, str(path)).startswith(f"{path}: locked.nothing: -2e+12 is no quantity")
+
+
+def test_a_urdf_in_the_encoding_that_it_declares(files):
+    text = ARM.replace("<robot", "<!-- Müller --><robot", 1)
+    latin = '<?xml version="1.0" encoding="ISO-8859-1"?>\r\n' + text
+    path = files(urdf="") / "arm.urdf"
+    path.write_bytes(latin.encode("latin-1"))
+    assert load_robot(str(path)).model.nv == 2
+    for wrong in (text.encode("latin-1"), latin.replace("ISO-8859-1", "no-such-code").encode("latin-1")):
+        path.write_bytes(wrong)
+        assert message(load_robot, str(path)) == (
+            f"{path}: not a text file in UTF-8, nor in what its first line declares"
+        )
+
+
 @pytest.mark.parametrize("number", ["1e-3", "1E-3", "0.001", ".001", "1.e-3", "+1e-3"])
 def test_every_way_to_write_a_number(files, number):
     folder = files(robot=changed(ROBOT, "5e-2", number))

@@ -8,8 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from ppcbf_robots.errors import InputError
-from ppcbf_robots.specs import read_text
-from ppcbf_robots.urdf import check_urdf
+from ppcbf_robots.urdf import check_urdf, parse_xml
 from ppcbf_robots.world_files.scene_parts import Scene, number, part_names, positive
 
 GEOMETRIES = ("box", "sphere", "cylinder", "mesh")
@@ -23,7 +22,7 @@ def read_urdf_world(scene: Scene) -> None:
             world cannot have.
     """
     check_urdf(scene.path)
-    root = ElementTree.fromstring(read_text(scene.path, "URDF"))
+    root = parse_xml(scene.path)
     placements = _placements(scene, root)
     for link in root.findall("link"):
         name = str(link.get("name"))
