@@ -182,19 +182,28 @@ def load_robot(name: str) -> Robot:
     controller = NominalController(model, gains, model.from_angles(goal))
     start_velocity = vector(velocity, model.nv, f"{path}: start_velocity")
     cover = cover if cover and cover.links else None
-    pairs, fixed, q_start = [], Body(spheres=[], links=[]), model.from_angles(start)
-    if spec.self_collision is not None:
-        fixed, srdf = derive_fixed(model), spec.self_collision.srdf
-        file = None if srdf is None else path.parent / srdf
-        postures = model.from_angles(domain.sample_q(np.random.default_rng(SAMPLE_SEED), POSTURES))
-        given = None if spec.start is None else q_start
-        pairs = self_pairs(model, body, fixed.spheres, given, postures, file, fitted=spec.body is None)
-        model.warnings += [
-            f"link '{x.link}' is fixed to the base, and the spheres that keep off it reach {x.largest:.2f} m beyond: "
-            "a box among the obstacles fits closer"
-            for x in fixed.links if x.largest > COARSE
-        ]  # fmt: skip
+    q_start = model.from_angles(start)
+    fixed, pairs = _self_collision(model, spec, path, body, domain, q_start)
     return Robot(name, model, spec, body, domain, controller, q_start, start_velocity, derived, pairs, fixed, cover)
+
+
+def _self_collision(
+    model: RobotModel, spec: RobotSpec, path: Path, body: Sequence[BodySphere], domain: Domain, start: Array
+) -> tuple[Body, list[tuple[int, int]]]:
+    """What is fixed to the base, and the pairs of spheres that keep off each other: nothing if it is not asked for."""
+    if spec.self_collision is None:
+        return Body(spheres=[], links=[]), []
+    fixed, srdf = derive_fixed(model), spec.self_collision.srdf
+    file = None if srdf is None else path.parent / srdf
+    postures = model.from_angles(domain.sample_q(np.random.default_rng(SAMPLE_SEED), POSTURES))
+    given = None if spec.start is None else start
+    pairs = self_pairs(model, body, fixed.spheres, given, postures, file, fitted=spec.body is None)
+    model.warnings += [
+        f"link '{x.link}' is fixed to the base, and the spheres that keep off it reach {x.largest:.2f} m beyond: "
+        "a box among the obstacles fits closer"
+        for x in fixed.links if x.largest > COARSE
+    ]  # fmt: skip
+    return fixed, pairs
 
 
 def load_problem(robot: str, world: str) -> Problem:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from itertools import combinations, product
 from pathlib import Path
 
@@ -39,40 +40,29 @@ def self_pairs(
     pair is left out where all of theirs are disabled.
     """
     spheres = [*body, *fixed]
+    radii = np.array([s.radius for s in spheres])
     points = robot.points([s.frame for s in spheres], np.array([s.center for s in spheres]))
-    joints, parents = points.joints, list(robot.model.parents)
     disabled = set() if srdf is None else disabled_links(srdf)
     _warn_of_strangers(robot, srdf, disabled)
     carried = _carried(robot) if fitted else {}
-    links = [carried.get(int(j), {s.frame}) if j else {s.frame} for s, j in zip(spheres, joints, strict=True)]
+    links = [carried.get(int(j), {s.frame}) if j else {s.frame} for s, j in zip(spheres, points.joints, strict=True)]
     p = points.kinematics(robot.evaluate_batch(postures, np.zeros((len(postures), robot.nv)))).p
-    root, reach = _reach(robot, points)
-    radii = np.array([s.radius for s in spheres])
     at_start = None if start is None else points.kinematics(robot.evaluate(start, np.zeros(robot.nv))).p
+    root, reach = _reach(robot, points)
+    meetings = _Meetings(robot, postures)
     found: list[tuple[int, int]] = []
     left_out: dict[str, set[str]] = {}
-    shapes, meets = None, dict[tuple[frozenset[str], frozenset[str]], NDArray[np.bool_] | None]()
-    carriers = {j: _carrier(robot, j) for j in set(joints.tolist()) if j and parents[j] == 0}
-    for i, j in combinations(range(len(spheres)), 2):
-        a, b = int(joints[i]), int(joints[j])
-        if a == b or (a and b and parents[a] == b) or (b and parents[b] == a):
-            continue
-        if b == 0 and carriers.get(a) == spheres[j].frame:
-            continue
+    for i, j in _apart(robot, spheres, points.joints.tolist()):
         if all(frozenset(pair) in disabled for pair in product(links[i], links[j])):
             continue
         both = radii[i] + radii[j]
-        if b == 0 and np.linalg.norm(p[0, j] - root) - reach[i] > both:
+        if points.joints[j] == 0 and np.linalg.norm(p[0, j] - root) - reach[i] > both:
             continue
         why, gap = "", np.linalg.norm(p[:, i] - p[:, j], axis=1) - both
         if at_start is not None and np.linalg.norm(at_start[i] - at_start[j]) <= both:
             why = "overlap at the start"
         elif np.mean(gap <= 0.0) > OFTEN or gap.max() < CLOSE:
-            key = frozenset(links[i]), frozenset(links[j])
-            if key not in meets:
-                shapes = shapes or _shapes(robot)
-                meets[key] = _meets(robot, shapes, *key, postures)
-            why = _coarse(gap <= 0.0, meets[key])
+            why = _coarse(gap <= 0.0, meetings.of(frozenset(links[i]), frozenset(links[j])))
         if why:
             left_out.setdefault(why, set()).add(f"{spheres[i].frame} / {spheres[j].frame}")
         else:
@@ -82,6 +72,17 @@ def self_pairs(
         for why, names in left_out.items()
     ]
     return found
+
+
+def _apart(robot: RobotModel, spheres: Sequence[BodySphere], joints: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Pairs of spheres that are no neighbours; ``joints`` move them, 0 none."""
+    parents = list(robot.model.parents)
+    carriers = {j: _carrier(robot, j) for j in set(joints) if j and parents[j] == 0}
+    for i, j in combinations(range(len(spheres)), 2):
+        a, b = joints[i], joints[j]  # what is fixed comes last
+        neighbours = a == b or (a and b and parents[a] == b) or (b and parents[b] == a)
+        if not neighbours and not (b == 0 and carriers.get(a) == spheres[j].frame):
+            yield i, j
 
 
 def _coarse(overlap: NDArray[np.bool_], meets: NDArray[np.bool_] | None) -> str:
@@ -101,30 +102,43 @@ def _carrier(robot: RobotModel, joint: int) -> str:
     return str(model.frames[model.frames[model.getFrameId(model.names[joint])].parentFrame].name)
 
 
-def _shapes(robot: RobotModel) -> pin.GeometryModel:
-    """As for the body's cover: collision geometry, and visual geometry of links without."""
-    shapes = robot.geometry(pin.GeometryType.COLLISION)
-    there = {o.parentFrame for o in shapes.geometryObjects}
-    for o in robot.geometry(pin.GeometryType.VISUAL).geometryObjects:
-        if o.parentFrame not in there:
-            o.name = f"visual {o.name}"
-            shapes.addGeometryObject(o)
-    return shapes
+class _Meetings:
+    """In which postures (B, nq) links meet; every question is answered once.
 
+    As for the body's cover, a link without collision geometry lends its visual geometry.
+    """
 
-def _meets(
-    robot: RobotModel, shapes: pin.GeometryModel, one: frozenset[str], other: frozenset[str], postures: Array
-) -> NDArray[np.bool_] | None:
-    """Whether shapes of two sets of links meet in the postures (B, nq); None where there are none."""
-    of = {i: robot.model.frames[o.parentFrame].name for i, o in enumerate(shapes.geometryObjects)}
-    pairs = [(i, j) for i in of for j in of if of[i] in one and of[j] in other]
-    if not pairs:
-        return None
-    shapes.removeAllCollisionPairs()
-    for pair in pairs:
-        shapes.addCollisionPair(pin.CollisionPair(*pair))
-    data, scratch = shapes.createData(), robot.model.createData()
-    return np.array([pin.computeCollisions(robot.model, scratch, shapes, data, q, True) for q in postures])
+    def __init__(self, robot: RobotModel, postures: Array) -> None:
+        self._robot, self._postures = robot, postures
+        self._known: dict[tuple[frozenset[str], frozenset[str]], NDArray[np.bool_] | None] = {}
+
+    @cached_property
+    def _shapes(self) -> pin.GeometryModel:
+        shapes = self._robot.geometry(pin.GeometryType.COLLISION)
+        there = {o.parentFrame for o in shapes.geometryObjects}
+        for o in self._robot.geometry(pin.GeometryType.VISUAL).geometryObjects:
+            if o.parentFrame not in there:
+                o.name = f"visual {o.name}"
+                shapes.addGeometryObject(o)
+        return shapes
+
+    def of(self, one: frozenset[str], other: frozenset[str]) -> NDArray[np.bool_] | None:
+        """Whether shapes of two sets of links meet (B,); None where there are none."""
+        if (one, other) not in self._known:
+            self._known[one, other] = self._computed(one, other)
+        return self._known[one, other]
+
+    def _computed(self, one: frozenset[str], other: frozenset[str]) -> NDArray[np.bool_] | None:
+        shapes, model = self._shapes, self._robot.model
+        of = {i: model.frames[o.parentFrame].name for i, o in enumerate(shapes.geometryObjects)}
+        pairs = [(i, j) for i in of for j in of if of[i] in one and of[j] in other]
+        if not pairs:
+            return None
+        shapes.removeAllCollisionPairs()
+        for pair in pairs:
+            shapes.addCollisionPair(pin.CollisionPair(*pair))
+        data, scratch = shapes.createData(), model.createData()
+        return np.array([pin.computeCollisions(model, scratch, shapes, data, q, True) for q in self._postures])
 
 
 def _reach(robot: RobotModel, points: BodyPoints) -> tuple[Array, Array]:
