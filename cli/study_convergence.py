@@ -46,7 +46,8 @@ def convergence(
 ) -> None:
     """How often and how fast training converges, by learning rate, beside the paper's Table 1.
 
-    A run has converged if its last check on fresh uniform band states is clean and the set has not collapsed. Writes
+    A run has converged if its last check and the evidence, on fresh uniform band states, are clean and the set has not
+    collapsed; `clean once` counts the runs that had any clean check, after `first clean` iterations. Writes
     results.jsonl, table.csv, table.md and convergence.png; the same command goes on after an interrupt. Exits with 3,
     after the table, if a run ended with an error.
 
@@ -69,5 +70,5 @@ def convergence(
     figure = out_dir / "convergence.png"
     plot_convergence(rows, figure)
     files = [out_dir / RESULTS, *write_table(rows, out_dir), figure]
-    title = f"{robot} in {obstacles}: shares of the runs, means over the converged ones, and the paper's Table 1"
+    title = f"{robot} in {obstacles}: shares of the runs, steps of the converged ones, and the paper's Table 1"
     show_study(title, rows, files, json, records)

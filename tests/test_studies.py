@@ -225,7 +225,7 @@ def test_the_study_of_convergence(cli, tmp_path):
     done = cli(*command, "--json")
     assert done.code == 0, done.stderr
     found = json.loads(done.stdout)
-    assert [(r["preset"], r["rate"], r["paper_converged"], r["paper_steps"]) for r in found["rows"]] == [
+    assert [(r["preset"], r["rate"], r["paper_share"], r["paper_steps"]) for r in found["rows"]] == [
         ("paper", 3e-3, None, None), ("paper", 1e-4, 0.7, 150),
         ("default", 3e-3, None, None), ("default", 1e-4, 0.7, 150),
     ]  # fmt: skip
@@ -262,10 +262,10 @@ def test_the_study_of_variability(cli, tmp_path):
 
 
 def record(
-    rate: float, converged: bool, reason: str = "clean", steps: int = 400, first_clean: int = 100
+    rate: float, converged: bool, reason: str = "clean", steps: int = 400, first_clean: int = 100, volume: float = 0.9
 ) -> dict[str, Any]:
     history = [{"iteration": i, "clean": i >= first_clean} for i in range(50, steps + 1, 50)]
-    result = {"converged": converged, "reason": reason, "steps": steps, "seconds": 2.0, "volume_kept": 0.9,
+    result = {"converged": converged, "reason": reason, "steps": steps, "seconds": steps / 200, "volume_kept": volume,
               "history": history}  # fmt: skip
     return {"key": {"preset": "paper", "learning_rate": rate}, "result": result}
 
@@ -274,12 +274,13 @@ def test_convergence_counts_and_means():
     collapsed = "collapsed: the safe set keeps 3.0% of the LB set"
     rows = convergence_rows(
         [record(1e-5, True), record(1e-5, True, steps=600, first_clean=200), record(1e-5, False, "3 of 500 violate"),
-         record(1e-5, False, collapsed), record(1e-3, False, collapsed)]
+         record(1e-5, False, collapsed, first_clean=500, volume=0.1), record(1e-3, False, collapsed, first_clean=500)]
     )  # fmt: skip
     assert rows[0] == {"preset": "paper", "rate": 1e-5, "runs": 4, "converged": 0.5, "collapsed": 0.25,
-                       "first_clean": 150, "steps": 500, "seconds": 2.0, "volume_kept": 0.9,
-                       "paper_converged": 1.0, "paper_steps": 400}  # fmt: skip
+                       "clean_once": 0.75, "first_clean": pytest.approx(400 / 3), "steps": 500, "seconds": 2.25,
+                       "volume_least": 0.1, "volume_most": 0.9, "paper_share": 1.0, "paper_steps": 400}  # fmt: skip
     assert (rows[1]["converged"], rows[1]["collapsed"], rows[1]["steps"]) == (0.0, 1.0, None)
+    assert (rows[1]["clean_once"], rows[1]["first_clean"]) == (0.0, None)
 
 
 def test_the_papers_table():

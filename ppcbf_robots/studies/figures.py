@@ -26,7 +26,9 @@ def plot_convergence(rows: Sequence[Row], path: Path) -> None:
     for preset in dict.fromkeys(row["preset"] for row in rows):
         mine = sorted((row for row in rows if row["preset"] == preset), key=lambda row: float(row["rate"]))
         rates = [row["rate"] for row in mine]
-        axes[0].plot(rates, [row["converged"] for row in mine], "o-", label=f"{preset} preset")
+        (line,) = axes[0].plot(rates, [row["converged"] for row in mine], "o-", label=f"{preset} preset")
+        once = [row["clean_once"] for row in mine]
+        axes[0].plot(rates, once, "o:", color=line.get_color(), label=f"{preset} preset, a clean check on the way")
         (line,) = axes[1].plot(rates, [_gap(row["steps"]) for row in mine], "o-", label=f"{preset} preset, whole run")
         first = [_gap(row["first_clean"]) for row in mine]
         axes[1].plot(rates, first, "o:", color=line.get_color(), label=f"{preset} preset, first clean check")
