@@ -65,10 +65,12 @@ def _plain(x: Any) -> Any:
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> None:
-    """A table on stdout."""
-    t = Table(title=title, title_justify="left", title_style="bold")
+    """A table on stdout; words in its head are not broken, at the price of the space about the cells."""
+    heads = [max(map(len, name.split()), default=0) for name in columns]
+    tight = sum(heads) + 3 * len(heads) + 1 > out.width
+    t = Table(title=title, title_justify="left", title_style="bold", padding=(0, 0) if tight else (0, 1))
     for i, name in enumerate(columns):
-        t.add_column(name, justify="left" if i == 0 else "right", overflow="fold", no_wrap=i == 0)
+        t.add_column(name, justify="left" if i == 0 else "right", overflow="fold", no_wrap=i == 0, min_width=heads[i])
     for row in rows:
         t.add_row(*row)
     out.print(t)
