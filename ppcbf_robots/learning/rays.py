@@ -21,7 +21,6 @@ from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array
 
 RayArrays = dict[str, Array]
-Index = torch.Tensor | slice
 CHUNK = 2000  # configurations evaluated at once, to bound memory
 BISECTIONS = 8  # before the last step, which is a secant
 FAR = 5.0  # [m/s], rho above which a row cannot matter
@@ -57,7 +56,7 @@ class Rays:
             **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in dataclasses.fields(self)}
         )
 
-    def select(self, index: Index) -> Rays:
+    def select(self, index: torch.Tensor | slice) -> Rays:
         """Some of the rays."""
         return Rays(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
 
