@@ -22,8 +22,10 @@ SOLVERS = ("daqp", "proxqp")
 
 
 def bench(
-    robot: Annotated[str, typer.Argument(help="Robot of the cases that grow with the pairs.")] = "panda",
-    obstacles: Annotated[str | None, typer.Argument(metavar="[OBSTACLES]", help="Time this world alone.")] = None,
+    robot: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="Robot of the cases that grow with the pairs.")
+    ] = "panda",
+    obstacles: Annotated[str | None, typer.Argument(metavar="OBSTACLES", help="Time this world alone.")] = None,
     barrier: Annotated[str, typer.Option(help="With OBSTACLES: barrier folder, lb-cbf or pp-cbf.")] = "lb-cbf",
     steps: Annotated[int, typer.Option(min=100, help="Steps per case.")] = 10_000,
     pairs: Annotated[

@@ -30,7 +30,7 @@ from ppcbf_robots.cli.simulate import (
     limit_rate,
     mujoco_engine,
 )
-from ppcbf_robots.cli.tasks import DaskOption, run_tasks
+from ppcbf_robots.cli.tasks import DaskOption, all_results, run_tasks
 from ppcbf_robots.engines import EngineName
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.filters import FilterConfig, FilterKind, Metric
@@ -169,9 +169,7 @@ def campaign(
     parts = [range(i, min(i + size, rollouts)) for i in range(0, rollouts, size)]
     tasks = [dataclasses.replace(whole, numbers=part).task() for part in parts]
     records = run_tasks(tasks, folder, jobs, dask, "rollouts")
-    errors = [record["error"] for record in records if "error" in record]
-    if errors:
-        raise CheckFailed(f"{len(errors)} of {len(records)} parts ended with an error; the first: {errors[0]}")
+    all_results(records, "parts")
     facts = _facts(whole, records)
     worst = dataclasses.replace(whole, numbers=range(facts["worst"]["min_h"], facts["worst"]["min_h"] + 1))
     _write(folder, facts, worst)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -11,19 +10,33 @@ import typer
 
 from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, number, out, table, yes
+from ppcbf_robots.cli.output import (
+    JsonOption,
+    RobotArgument,
+    WorldArgument,
+    check_folder,
+    emit_json,
+    err,
+    number,
+    out,
+    table,
+    yes,
+)
 from ppcbf_robots.cli.simulate import choose_barrier, run
-from ppcbf_robots.cli.train import Device, Kind, PresetChoice, train_barrier
+from ppcbf_robots.cli.tasks import IterationsOption
+from ppcbf_robots.cli.train import Device, train_barrier
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.evidence import volume_ratio
 from ppcbf_robots.filters import FilterKind, Metric
+from ppcbf_robots.learning.presets import LearnedKind, PresetName
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.rollout import Trajectory
+from ppcbf_robots.studies.tables import write_csv
 
 KEYS = ("volume_kept", "min_h", "max_torque_ratio", "energy_rise", "injected", "cleared_at", "reached_goal", "rests_on")
 
 
-LEARNED: dict[str, tuple[Kind, PresetChoice]] = {
+LEARNED: dict[str, tuple[LearnedKind, PresetName]] = {
     "ncbf": ("ncbf", "paper"),
     "pp-ncbf": ("pp-ncbf", "paper"),
     "pp-ncbf-default": ("pp-ncbf", "default"),
@@ -46,7 +59,7 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the training.")] = 0,
     duration: Annotated[float, typer.Option(min=0.1, help="Simulated seconds of every run.")] = 15.0,
     device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
-    iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
+    iterations: IterationsOption = None,
     reuse: Annotated[bool, typer.Option(help="Take barriers already in DIR if they fit.")] = True,
     json: JsonOption = False,
 ) -> None:
@@ -60,8 +73,7 @@ def compare(
     """
     problem = load_problem(robot, obstacles)
     problem.check_start(problem.robot.start)
-    if out_dir.exists() and not out_dir.is_dir():
-        raise InputError(f"--out: {out_dir} is a file; give a folder")
+    check_folder(out_dir)
     failed = []
     for name, (kind, preset) in LEARNED.items():
         folder = out_dir / name
@@ -86,7 +98,7 @@ def compare(
 
 
 def _earlier(
-    folder: Path, problem: Problem, kind: Kind, preset: PresetChoice, seed: int, iterations: int | None
+    folder: Path, problem: Problem, kind: LearnedKind, preset: PresetName, seed: int, iterations: int | None
 ) -> dict[str, Any] | None:
     """Training report of a barrier in the folder that this very training would give; None if there is none."""
     try:
@@ -144,21 +156,13 @@ def _write(
 ) -> list[str]:
     from ppcbf_robots import plots  # matplotlib only where it is needed
 
-    try:
-        with (out_dir / "table.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise InputError(f"{out_dir}/table.csv: cannot be written ({error.strerror})") from None
+    write_csv(rows, out_dir / "table.csv")
     plots.plot_runs(problem, runs, out_dir / "runs.png")
     plots.plot_paths(problem, runs, out_dir / "paths.png")
     files = ["table.csv", "runs.png", "paths.png"]
     if problem.model.nv >= 2:
-        v = problem.robot.domain.v
-        velocities = [np.zeros(len(v)), 0.5 * np.minimum(v[:, 1], 1.0)]
         shown = {k: b for k, b in barriers.items() if k in ("LB-CBF", "NCBF", "PP-CBF", "PP-NCBF")}
-        plots.plot_safe_set(problem, shown, velocities, out_dir / "safe_set.png")
+        plots.plot_safe_set(problem, shown, plots.slice_velocities(problem), out_dir / "safe_set.png")
         files.append("safe_set.png")
     return [str(out_dir / f) for f in files]
 

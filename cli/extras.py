@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from ppcbf_robots.errors import InputError
 
-PACKAGES = {"study": ("hj_reachability", "jax", "casadi", "joblib"), "verify": ("casadi",)}
+PACKAGES = {"study": ("hj_reachability", "jax", "casadi"), "verify": ("casadi",)}
 
 
 @contextmanager

@@ -22,7 +22,7 @@ MANY_PLANES = 500  # of a convex mesh, with which a step takes twice as long
 
 def info(
     robot: RobotArgument,
-    obstacles: Annotated[str | None, typer.Argument(metavar="[OBSTACLES]", help="World to check the robot in.")] = None,
+    obstacles: Annotated[str | None, typer.Argument(metavar="OBSTACLES", help="World to check the robot in.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Show what a robot (in a world) looks like to the tool, and whether it needs training.

@@ -8,12 +8,14 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from ppcbf_robots.errors import InputError
 from ppcbf_robots.world import WorldSpec
 
 _PIPE_WIDTH = 120  # of tables that do not go to a terminal
@@ -74,6 +76,12 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     for row in rows:
         t.add_row(*row)
     out.print(t)
+
+
+def check_folder(path: Path) -> None:
+    """InputError if results cannot go there, since it is a file."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"--out: {path} is a file; give a folder")
 
 
 def obstacle_rows(world: WorldSpec) -> list[list[str]]:

@@ -26,7 +26,9 @@ from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array, vector
 
 BarrierOption = Annotated[str, typer.Option(help="Barrier folder, or lb-cbf, pp-cbf, none.")]
-FilterOption = Annotated[FilterKind | None, typer.Option(help="Default: what the barrier was trained for, else qp.")]
+FilterOption = Annotated[
+    FilterKind | None, typer.Option(help="Default: what the barrier was trained for; pp-cbf closed-form, others qp.")
+]
 MetricOption = Annotated[Metric | None, typer.Option(help="Default: what the barrier was trained for, else kinetic.")]
 EngineOption = Annotated[
     EngineName, typer.Option(help="mujoco: another simulator, in which the robot can touch the obstacles.")

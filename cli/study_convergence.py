@@ -36,7 +36,7 @@ def convergence(
     robot: RobotArgument = "cartpole",
     obstacles: WorldArgument = "wall",
     runs: Annotated[int, typer.Option(min=1, max=10_000, help="Runs per learning rate; run i has seed i.")] = 20,
-    rate_list: Annotated[str, typer.Option("--rates", metavar="R,...", help="Learning rates.")] = RATES,
+    rate_list: Annotated[str, typer.Option("--rates", metavar="R,...", help="Learning rates; the paper's.")] = RATES,
     preset: Annotated[Literal["both", PresetName], typer.Option(help="Settings of the runs.")] = "both",
     iterations: IterationsOption = None,
     time_limit: TimeLimitOption = 3600.0,

@@ -11,14 +11,15 @@ import typer
 
 from ppcbf_robots.cli.extras import needs
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
-from ppcbf_robots.cli.study_safe_set import NodesOption, ViableOption, viable_set, write_csv
 from ppcbf_robots.cli.tasks import DaskOption, JobsOption, OutOption, all_results, run_tasks
+from ppcbf_robots.cli.viable import NodesOption, ViableOption, viable_set
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem, load_problem, parse_vector
 from ppcbf_robots.resources import portable
 from ppcbf_robots.safe_sets import Mask, levels_at
 from ppcbf_robots.set_tasks import known_barriers
 from ppcbf_robots.specs import Array, vector
+from ppcbf_robots.studies.tables import write_csv
 from ppcbf_robots.sweep import Task
 
 Point = dict[str, Any]
@@ -44,7 +45,8 @@ def nmpc(
 
     A state counts as safe for the NMPC if IPOPT finds a trajectory of N steps within torque limits, joint limits and
     clear of the obstacles, which may be spheres and half-spaces. The paper leaves the cost open; here it is the
-    distance to the robot's goal, its speed and a little of its torque. The same command goes on after an interrupt.
+    distance to the robot's goal, its speed and a little of its torque. Writes results.jsonl, points.csv, overlaps.csv
+    and nmpc.png; the same command goes on after an interrupt. Exits with 3 if a plan ended with an error.
 
     Example: ppcbf study nmpc cartpole wall --out runs/nmpc --jobs 2
     """
@@ -53,10 +55,11 @@ def nmpc(
         raise InputError("the study is over the first two joints, this robot has one")
     v = vector(parse_vector(velocity, "--velocity") or [], problem.model.nv, "--velocity")
     x, y = (np.linspace(low, high, grid) for low, high in problem.robot.domain.q[:2])
-    from ppcbf_robots.plots_study import plot_nmpc, slice_states  # matplotlib only where it is needed
+    from ppcbf_robots.plots import slice_states  # matplotlib only where it is needed
+    from ppcbf_robots.plots_study import plot_nmpc
 
     q = slice_states(problem, x, y)
-    barriers = known_barriers(problem, [Path(folder) for folder in barrier or []])
+    barriers = known_barriers(problem, [Path(folder).resolve() for folder in barrier or []])
     tasks = planning_tasks(problem, (robot, obstacles), (steps, dt, iterations), problem.model.to_angles(q), v)
     reference = viable_set(problem, nodes) if viable and problem.model.nv == 2 else None
     points = all_results(run_tasks(tasks, out_dir, jobs, dask, "plans"), "plans")
@@ -65,8 +68,8 @@ def nmpc(
     sets = {name: level >= 0.0 for name, level in levels.items()}
     rows = overlaps(found, sets)
     files = [str(out_dir / name) for name in ("points.csv", "overlaps.csv", "nmpc.png")]
-    write_csv(Path(files[0]), _flat(problem, q, points, sets))
-    write_csv(Path(files[1]), rows)
+    write_csv(_flat(problem, q, points, sets), Path(files[0]))
+    write_csv(rows, Path(files[1]))
     square = {name: level.reshape(grid, grid) for name, level in levels.items()}
     plot_nmpc(problem, x, y, square, found.reshape(grid, grid), v, Path(files[2]))
     if json:

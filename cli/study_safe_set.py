@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.progress import Progress
 
-from ppcbf_robots.cli.extras import needs
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, table
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, out, table
 from ppcbf_robots.cli.tasks import DaskOption, JobsOption, OutOption, all_results, run_tasks
-from ppcbf_robots.errors import InputError
+from ppcbf_robots.cli.viable import NodesOption, ViableOption, viable_set
 from ppcbf_robots.problem import Problem, parse_vector
 from ppcbf_robots.resources import portable
 from ppcbf_robots.safe_sets import FREE, VIABLE, BoundaryCheck, Membership
 from ppcbf_robots.set_tasks import LB, PP, SetsJob, boundary_tasks, counted, volume_tasks
 from ppcbf_robots.specs import Array, vector
-from ppcbf_robots.viable_set import ViableSet
-
-NodesOption = Annotated[int, typer.Option(min=7, max=101, help="Nodes per axis of the viable set's grid.")]
-ViableOption = Annotated[bool, typer.Option(help="The viable set too, where the robot has 2 joints.")]
+from ppcbf_robots.studies.tables import cell, write_csv
 
 
 def safe_set(
@@ -39,7 +32,7 @@ def safe_set(
     boundary: Annotated[int, typer.Option(min=1, help="Boundary states of every set for the QP.")] = 1000,
     viable: ViableOption = True,
     nodes: NodesOption = 41,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the states.")] = 0,
     jobs: JobsOption = 1,
     dask: DaskOption = None,
     json: JsonOption = False,
@@ -48,8 +41,9 @@ def safe_set(
 
     Volumes are shares of the same uniform states of X. "Not viable" is the share of a set from which no torque within
     the limits avoids a collision; "infeasible" the share of states at a set's boundary where no torque within the
-    limits satisfies its rows. The PP-CBF's set is a reference only where it is feasible. The same command goes on after
-    an interrupt.
+    limits satisfies its rows. The PP-CBF's set is a reference only where it is feasible. Writes
+    results.jsonl, volumes.csv and safe_set.png; the same command goes on after an interrupt. Exits with 3 if a task
+    ended with an error.
 
     Example: ppcbf study safe-set cartpole wall --barrier runs/cartpole --out runs/sets
     """
@@ -69,10 +63,11 @@ def safe_set(
     for row in rows:
         check = checks.get(row["set"])
         row |= {"infeasible": None if check is None else check.share, "boundary": 0 if check is None else check.samples}
+        row["gamma"] = None if check is None else barriers[row["set"]].spec.gamma
     if any(row["set"] == PP and row["infeasible"] for row in rows):  # a set that no filter can keep is no measure
         rows = [row | {"of_pp": None, "of_pp_error": None} for row in rows]
     files = [str(out_dir / "volumes.csv"), str(out_dir / "safe_set.png")]
-    write_csv(Path(files[0]), rows)
+    write_csv(rows, Path(files[0]))
     if problem.model.nv >= 2:
         from ppcbf_robots.plots_study import plot_sets  # matplotlib only where it is needed
 
@@ -86,28 +81,13 @@ def safe_set(
         out.print("wrote " + ", ".join(files))
 
 
-def viable_set(problem: Problem, nodes: int) -> ViableSet:
-    """The viable set, with its progress on stderr."""
-    with needs("study", "the viable set"):
-        from ppcbf_robots import viability
-    with Progress(console=err, transient=True) as progress:
-        task = progress.add_task("viable set", total=None)
-        return viability.solve(problem, nodes, on_sweeps=_shown(progress, task))
-
-
-def _shown(progress: Progress, task: Any) -> Callable[[int, float], None]:
-    def show(sweeps: int, change: float) -> None:
-        progress.update(task, description=f"viable set: {sweeps} sweeps, V changes by {change:.1e} m")
-
-    return show
-
-
 def _velocities(problem: Problem, given: list[str] | None) -> list[Array]:
-    """Velocities of the slices: as given, else rest and 0.5, as the paper's figures, where X reaches that far."""
-    nv, v = problem.model.nv, problem.robot.domain.v
+    """Velocities of the slices, as given or as in the paper's figures."""
     if not given:
-        return [np.zeros(nv), 0.5 * np.minimum(v[:, 1], 1.0)]
-    return [vector(parse_vector(text, "--velocity") or [], nv, "--velocity") for text in given]
+        from ppcbf_robots.plots import slice_velocities  # matplotlib only where it is needed
+
+        return slice_velocities(problem)
+    return [vector(parse_vector(text, "--velocity") or [], problem.model.nv, "--velocity") for text in given]
 
 
 def _row(found: Membership, name: str) -> dict[str, Any]:
@@ -121,22 +101,11 @@ def _row(found: Membership, name: str) -> dict[str, Any]:
     return row
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Rows with the keys of the first one as columns; InputError where it cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-
-
 def _print(problem: Problem, rows: list[dict[str, Any]]) -> None:
-    columns = ["set", "of X", "of LB-CBF", "of PP-CBF", "of viable", "not viable", "infeasible"]
+    columns = ["set", "gamma", "of X", "of LB-CBF", "of PP-CBF", "of viable", "not viable", "infeasible"]
     cells = [
-        [r["set"], *(_percent(r[k], r[f"{k}_error"]) for k in ("of_X", "of_lb", "of_pp", "of_viable")),
+        [r["set"], cell(r["gamma"]),
+         *(_percent(r[k], r[f"{k}_error"]) for k in ("of_X", "of_lb", "of_pp", "of_viable")),
          _percent(r["not_viable"]), _percent(r["infeasible"])]
         for r in rows
     ]  # fmt: skip

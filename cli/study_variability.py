@@ -17,6 +17,7 @@ from ppcbf_robots.cli.tasks import (
     IterationsOption,
     JobsOption,
     OutOption,
+    PresetOption,
     TimeLimitOption,
     ended,
     finite,
@@ -25,13 +26,12 @@ from ppcbf_robots.cli.tasks import (
     seeds,
     show_study,
 )
-from ppcbf_robots.learning.presets import PresetName
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.resources import portable
 from ppcbf_robots.results_file import Record
 from ppcbf_robots.specs import Array
 from ppcbf_robots.studies.tables import write_table
-from ppcbf_robots.studies.training import Training
+from ppcbf_robots.studies.training import Training, check_folders
 from ppcbf_robots.studies.variability import overlaps, variability_rows
 
 
@@ -40,7 +40,7 @@ def variability(
     robot: RobotArgument = "cartpole",
     obstacles: WorldArgument = "wall",
     seed_list: Annotated[str, typer.Option("--seeds", metavar="0-9", help="Seeds, such as 0-4 or 1,3,5.")] = "0-9",
-    preset: Annotated[PresetName, typer.Option(help="Recommended settings, or the paper's.")] = "default",
+    preset: PresetOption = "default",
     iterations: IterationsOption = None,
     time_limit: TimeLimitOption = 3600.0,
     jobs: JobsOption = 1,
@@ -62,7 +62,9 @@ def variability(
     ]
     records = run_tasks([training.task(problem) for training in trainings], out_dir, jobs, dask)
     found = ended(records)
-    barriers = [load_barrier(_folder(out_dir, record["key"]["seed"])).barrier(problem) for record in found]
+    folders = [_folder(out_dir, record["key"]["seed"]) for record in found]
+    check_folders(found, folders)
+    barriers = [load_barrier(folder).barrier(problem) for folder in folders]
     rows = variability_rows(found, overlaps(problem, barriers, np.random.default_rng(0)))
     figures = _figures(problem, found, barriers, out_dir)
     files = [out_dir / RESULTS, *write_table(rows, out_dir), *figures]

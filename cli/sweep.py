@@ -15,6 +15,7 @@ from ppcbf_robots.cli.tasks import (
     IterationsOption,
     JobsOption,
     OutOption,
+    PresetOption,
     TimeLimitOption,
     finite,
     names,
@@ -23,12 +24,11 @@ from ppcbf_robots.cli.tasks import (
     seeds,
 )
 from ppcbf_robots.errors import CheckFailed, InputError
-from ppcbf_robots.learning.presets import PresetName
 from ppcbf_robots.problem import load_problem
 from ppcbf_robots.resources import portable
 from ppcbf_robots.results_file import Record
 from ppcbf_robots.studies.tables import cell
-from ppcbf_robots.studies.training import Training
+from ppcbf_robots.studies.training import Training, check_folders
 from ppcbf_robots.sweep import Task
 
 KEYS = ("converged", "volume_kept", "violations", "samples", "seconds", "reason")
@@ -39,7 +39,7 @@ def sweep(
     worlds: Annotated[str, typer.Option(metavar="X,Y", help="Worlds: names or paths, as for train.")],
     out_dir: OutOption,
     seed_list: Annotated[str, typer.Option("--seeds", metavar="0-4", help="Seeds, such as 0-4 or 1,3,5.")] = "0",
-    preset: Annotated[PresetName, typer.Option(help="Recommended settings, or the paper's.")] = "default",
+    preset: PresetOption = "default",
     iterations: IterationsOption = None,
     time_limit: TimeLimitOption = 3600.0,
     jobs: JobsOption = 1,
@@ -64,6 +64,7 @@ def sweep(
             training = Training(portable(robot), portable(world), preset, chosen, seed, limit, folder)
             tasks[folder] = training.task(problem)
     records = run_tasks(list(tasks.values()), out_dir, jobs, dask)
+    check_folders(records, list(tasks))
     rows = [_row(record, folder) for record, folder in zip(records, tasks, strict=True)]
     if json:
         emit_json({"rows": rows, "results": str(out_dir / RESULTS)})

@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ppcbf_robots.cli.output import emit_json, err, out, table
+from ppcbf_robots.cli.output import check_folder, emit_json, err, out, table
 from ppcbf_robots.errors import CheckFailed, InputError
 from ppcbf_robots.learning.presets import PRESETS, Preset, PresetName
 from ppcbf_robots.results_file import Record
@@ -30,6 +30,7 @@ DaskOption = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler instead.")
 ]
 IterationsOption = Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")]
+PresetOption = Annotated[PresetName, typer.Option(help="Recommended settings, or the paper's.")]
 TimeLimitOption = Annotated[float, typer.Option(min=1.0, help="Stop each training after so many seconds.")]
 
 
@@ -46,8 +47,7 @@ def run_tasks(
         return int(key.get("count", 1))
 
     total = sum(size(task.key) for task in tasks)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out: {folder} is a file; give a folder")
+    check_folder(folder)
     columns = (TextColumn(what), BarColumn(bar_width=24), MofNCompleteColumn(),
                TextColumn("{task.fields[failed]}"), TimeElapsedColumn())  # fmt: skip
     with Progress(*columns, console=err) as progress:
@@ -102,11 +102,11 @@ def preset_with(name: PresetName, iterations: int | None, **changes: Any) -> Pre
     return dataclasses.replace(PRESETS[name], **given, **changes)
 
 
-def finite(time_limit: float) -> float:
-    """The option --time-limit, which goes into the key of a task as JSON."""
-    if not math.isfinite(time_limit):
-        raise InputError(f"--time-limit must be finite, got {time_limit}")
-    return time_limit
+def finite(value: float, option: str = "--time-limit") -> float:
+    """The value of an option: the command line knows nan and inf, the key of a task does not."""
+    if not math.isfinite(value):
+        raise InputError(f"{option} must be finite, got {value}")
+    return value
 
 
 def names(text: str, option: str) -> list[str]:

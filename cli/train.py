@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,8 +12,10 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, emit_json, err, out, warn
+from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument, check_folder, emit_json, err, out, warn
+from ppcbf_robots.cli.tasks import IterationsOption, PresetOption, preset_with
 from ppcbf_robots.errors import CheckFailed, InputError
+from ppcbf_robots.learning.presets import LearnedKind, PresetName
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.robot import RobotModel
 from ppcbf_robots.specs import Array, BarrierSpec, validate
@@ -22,8 +23,6 @@ from ppcbf_robots.specs import Array, BarrierSpec, validate
 if TYPE_CHECKING:
     from ppcbf_robots.learning.train import Monitor
 
-Kind = Literal["pp-ncbf", "ncbf"]
-PresetChoice = Literal["default", "paper"]
 Device = Literal["auto", "cpu", "cuda"]
 
 
@@ -31,12 +30,15 @@ def train(
     robot: RobotArgument,
     obstacles: WorldArgument,
     out_dir: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the barrier.")],
-    barrier: Annotated[Kind, typer.Option(help="PP-NCBF (limits and passivity) or NCBF (limits).")] = "pp-ncbf",
-    preset: Annotated[PresetChoice, typer.Option(help="Recommended settings, or the paper's.")] = "default",
+    barrier: Annotated[LearnedKind, typer.Option(help="PP-NCBF (limits and passivity) or NCBF (limits).")] = "pp-ncbf",
+    preset: PresetOption = "default",
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of every random draw.")] = 0,
     device: Annotated[Device, typer.Option(help="Where to train.")] = "auto",
-    gamma: Annotated[float | None, typer.Option(help="gamma of phi = dh/dt + gamma h - K [1/s].")] = None,
-    iterations: Annotated[int | None, typer.Option(min=1, help="Planned iterations instead of the preset's.")] = None,
+    gamma: Annotated[
+        float | None,
+        typer.Option(help="gamma of phi = dh/dt + gamma h - K [1/s]; by default the robot spec's, else the preset's."),
+    ] = None,
+    iterations: IterationsOption = None,
     time_limit: Annotated[float, typer.Option(min=1.0, help="Stop training after so many seconds.")] = 3600.0,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoint in DIR.")] = False,
     counterexamples: Annotated[
@@ -55,8 +57,7 @@ def train(
     if gamma is not None:
         given = problem.robot.spec.barrier.model_dump(exclude_unset=True) | {"gamma": gamma}
         problem = problem.with_barrier_spec(validate(given, BarrierSpec, "--gamma"))
-    if out_dir.exists() and not out_dir.is_dir():
-        raise InputError(f"--out: {out_dir} is a file; give a folder")
+    check_folder(out_dir)
     warn(problem.model.warnings)
     states = None if counterexamples is None else load_states(counterexamples, problem.model)
     report = train_barrier(
@@ -80,7 +81,7 @@ def load_states(path: Path, model: RobotModel) -> tuple[Array, Array]:
     try:
         with np.load(path, allow_pickle=False) as file:
             q, v = (np.asarray(file[name], dtype=float) for name in "qv")
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile):
         raise InputError(f"--counterexamples: {path} is not an npz file with the arrays q and v") from None
     if q.ndim != 2 or not len(q) or q.shape[1] != model.nq or v.shape != (len(q), model.nv):
         expected = f"q (n, {model.nq}) and v (n, {model.nv})"
@@ -92,8 +93,8 @@ def load_states(path: Path, model: RobotModel) -> tuple[Array, Array]:
 
 def train_barrier(
     problem: Problem,
-    kind: Kind,
-    preset_name: PresetChoice,
+    kind: LearnedKind,
+    preset_name: PresetName,
     seed: int,
     folder: Path,
     device: Device = "auto",
@@ -107,13 +108,10 @@ def train_barrier(
     import torch  # takes seconds: only where it is needed
 
     from ppcbf_robots.learning.checkpoint import load_checkpoint, save_checkpoint
-    from ppcbf_robots.learning.presets import PRESETS
     from ppcbf_robots.learning.store import store
     from ppcbf_robots.learning.train import Trainer
 
-    chosen = PRESETS[preset_name]
-    if iterations is not None:
-        chosen = dataclasses.replace(chosen, iterations=iterations)
+    chosen = preset_with(preset_name, iterations)
     for change in chosen.changes:
         err.print(f"changed from the paper: {change}", style="dim")
     where = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
@@ -140,7 +138,7 @@ def train_barrier(
 
 
 @contextlib.contextmanager
-def _progress(kind: Kind, planned: int) -> Iterator[Callable[[Monitor], None]]:
+def _progress(kind: LearnedKind, planned: int) -> Iterator[Callable[[Monitor], None]]:
     """A bar with the monitors: volume kept, band yield, share of band states that violate, start inside."""
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[monitors]}"),
                TimeElapsedColumn())  # fmt: skip
@@ -169,7 +167,10 @@ def _tensorboard(folder: Path | None) -> Iterator[Callable[[Monitor], None]]:
         raise InputError(
             '--tensorboard needs the tensorboard package: pip install "ppcbf-robots[tensorboard]"'
         ) from None
-    writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+    try:
+        writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise InputError(f"--tensorboard: {folder} cannot be written ({error.strerror})") from None
 
     def record(m: Monitor) -> None:
         for name in ("volume_kept", "band_yield", "torque", "passivity", "loss"):

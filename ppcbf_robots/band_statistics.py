@@ -70,16 +70,17 @@ def independent_band(
         v = domain.sample_v(rng, CHUNK)
         h, grad = problem.safety.first_order(q)
         free = np.flatnonzero(h.min(axis=-1) >= 0.0)
-        tried += CHUNK
+        on = free
         if free.size:
             phi = least_phi(problem, barrier, q[free], h[free], grad[free], v[free, None])[:, 0]
-            on = free[(phi >= 0.0) & (phi <= epsilon)]
+            on = free[(phi >= 0.0) & (phi <= epsilon)][: count - found]
             kept_q.append(q[on])
             kept_v.append(v[on])
             found += len(on)
+        tried += CHUNK if found < count else int(on[-1]) + 1  # those after the last that was wanted say nothing
         if not found and tried >= MAX_TRIED:
             raise CheckFailed(f"none of {tried:,} uniform states of X lies on the band: the safe set has collapsed")
-    return np.concatenate(kept_q)[:count], np.concatenate(kept_v)[:count], tried
+    return np.concatenate(kept_q), np.concatenate(kept_v), tried
 
 
 def count_violations(

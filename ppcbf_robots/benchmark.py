@@ -14,6 +14,7 @@ from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.evidence import uniform_band
 from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.learning.presets import DEFAULT
 from ppcbf_robots.network import NumpyNetwork, random_convex
 from ppcbf_robots.problem import Problem, Robot
 from ppcbf_robots.safety_filter import SafetyFilter
@@ -22,8 +23,6 @@ from ppcbf_robots.world import Obstacle, Sphere, WorldSpec
 
 STATES = 400  # different ones, cycled through
 STAGES = ("kinematics and dynamics", "geometry", "network", "QP")
-HIDDEN, UNITS = (64, 64), 12  # of the default preset
-COVERED_JOINTS = 2  # up to which the default preset's K has no share of the kinetic energy
 REACH = (0.45, 1.1)  # [m], where the obstacles of a synthetic world stand
 
 
@@ -67,11 +66,12 @@ def default_barrier(problem: Problem) -> Barrier:
     Where K bends more within a control period, the QP is solved more often (:mod:`ppcbf_robots.cutting_planes`).
     """
     model, rng = problem.model, np.random.default_rng(0)
-    params = random_convex(model.nq, model.nv, HIDDEN, UNITS, rng)
-    params |= {"v_scale": 1.0 / model.v_max, "ba": np.full(UNITS, -3.0), "bb": rng.normal(0.0, 1.0, UNITS * model.nv)}
+    units = DEFAULT.units
+    params = random_convex(model.nq, model.nv, DEFAULT.hidden, units, rng)
+    params |= {"v_scale": 1.0 / model.v_max, "ba": np.full(units, -3.0), "bb": rng.normal(0.0, 1.0, units * model.nv)}
     params |= {"cone_a": np.array(-2.5), "cone_b": np.full(model.nv, 0.2), "cone_c": np.array(-3.4)}
     params |= {"bowl_a": np.array(-3.2), "bowl_b": np.full(model.nv, 1.1), "bowl_c": np.array(5.5)}
-    if model.nv > COVERED_JOINTS:
+    if model.nv > DEFAULT.covered_joints:
         params |= {"energy_a": np.array(-1.6), "energy_scale": np.array(0.2)}
     return problem.barrier("pp-ncbf", NumpyNetwork("convex", params))
 

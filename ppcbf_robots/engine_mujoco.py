@@ -127,22 +127,6 @@ class MujocoEngine:
         turn, origin = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
         return self._mesh_contact.touches(part.mesh, turn @ part.rotation, origin + turn @ part.xyz, obstacle)
 
-    def mass_and_bias(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """MuJoCo's mass matrix M (nv, nv) and bias torque C v + g (nv,) at (q, v), which becomes the state."""
-        self.reset(q, v)
-        mujoco.mj_forward(self.model, self.data)
-        M = np.empty((self.robot.nv, self.robot.nv))
-        for column, unit in zip(M, np.eye(self.robot.nv), strict=True):
-            mujoco.mj_mulM(self.model, self.data, column, unit)
-        return M[np.ix_(self.dofs, self.dofs)], np.array(self.data.qfrc_bias[self.dofs])
-
-    def acceleration(self, q: Array, v: Array, u: Array) -> Array:
-        """MuJoCo's forward dynamics (nv,) at (q, v), which becomes the state; contact forces included."""
-        self.reset(q, v)
-        self.data.qfrc_applied[self.dofs] = u
-        mujoco.mj_forward(self.model, self.data)
-        return np.array(self.data.qacc[self.dofs])
-
 
 def _name(joint: int) -> str:
     """Name of a joint and its body: numbers cannot clash with MuJoCo's own names."""

@@ -165,13 +165,24 @@ def safe_set_slices(problem: Problem, velocities: Sequence[Array], beyond: float
     domain, model = problem.robot.domain, problem.model
     reach = beyond * (domain.q[:, 1] - domain.q[:, 0])
     x, y = (np.linspace(domain.q[i, 0] - reach[i], domain.q[i, 1] + reach[i], GRID) for i in (0, 1))
-    X, Y = np.meshgrid(x, y)
-    angles = np.tile(model.to_angles(problem.robot.start), (X.size, 1))
-    angles[:, 0], angles[:, 1] = X.ravel(), Y.ravel()
-    q = model.from_angles(angles)
+    q, (X, Y) = slice_states(problem, x, y), np.meshgrid(x, y)
     for v in velocities:
         dyn = model.evaluate_batch(q, np.tile(v, (len(q), 1)))
         yield Slice(X, Y, dyn, problem.safety.evaluate(dyn))
+
+
+def slice_velocities(problem: Problem) -> list[Array]:
+    """Rest, and 0.5 of every joint as in the paper's figures, where X reaches that far."""
+    v = problem.robot.domain.v
+    return [np.zeros(len(v)), 0.5 * np.minimum(v[:, 1], 1.0)]
+
+
+def slice_states(problem: Problem, x: Array, y: Array) -> Array:
+    """Configurations (m n, nq) over the first two joints, x (n,) fastest; the others at the start."""
+    X, Y = np.meshgrid(x, y)
+    angles = np.tile(problem.model.to_angles(problem.robot.start), (X.size, 1))
+    angles[:, 0], angles[:, 1] = X.ravel(), Y.ravel()
+    return problem.model.from_angles(angles)
 
 
 def slice_title(what: str, v: Array) -> str:

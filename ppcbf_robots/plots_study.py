@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.plots import save_figure
+from ppcbf_robots.plots import save_figure, slice_states, slice_title
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.safe_sets import FREE, Mask, levels_at
 from ppcbf_robots.specs import Array
@@ -49,20 +49,12 @@ def plot_nmpc(
     save_figure(fig, path)
 
 
-def slice_states(problem: Problem, x: Array, y: Array) -> Array:
-    """Configurations (m n, nq) over the first two joints, x (n,) fastest; the others at the start."""
-    X, Y = np.meshgrid(x, y)
-    angles = np.tile(problem.model.to_angles(problem.robot.start), (X.size, 1))
-    angles[:, 0], angles[:, 1] = X.ravel(), Y.ravel()
-    return problem.model.from_angles(angles)
-
-
 def _draw(ax: Any, problem: Problem, x: Array, y: Array, levels: Mapping[str, Array], v: Array) -> None:
     ax.contourf(x, y, levels[FREE], levels=[-1e9, 0.0], colors=["0.85"])
     for i, (name, level) in enumerate((k, m) for k, m in levels.items() if k != FREE):
         ax.contour(x, y, level, levels=[0.0], colors=[f"C{i}"])
         ax.plot([], [], color=f"C{i}", label=name)
-    ax.set_title("v = (" + ", ".join(f"{s:g}" for s in v[:4]) + ("...)" if len(v) > 4 else ")"))
+    ax.set_title(slice_title("safe sets", v))
     ax.set_xlabel(problem.model.joint_names[0])
     ax.set_ylabel(problem.model.joint_names[1])
     ax.legend(frameon=True, fontsize=8)

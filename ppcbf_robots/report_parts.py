@@ -110,10 +110,8 @@ def _training(m: Material) -> Section:
 def _safe_set(m: Material) -> Section:
     if m.problem.model.nv < 2:
         return Section("safe-set", "Safe set", ["Slices need two joints; this robot has one."])
-    v = m.problem.robot.domain.v
-    speeds = [np.zeros(len(v)), 0.5 * np.minimum(v[:, 1], 1.0)]
     shown = {"LB-CBF": m.problem.barrier("lb-cbf"), m.stored.kind.upper(): m.barrier}
-    svg = _drawn(lambda path: plots.plot_safe_set(m.problem, shown, speeds, path))
+    svg = _drawn(lambda path: plots.plot_safe_set(m.problem, shown, plots.slice_velocities(m.problem), path))
     first, second = m.problem.model.joint_names[:2]
     alt = (
         f"Two slices over {first} and {second}, the other joints at the start: boundaries of the safe sets of the "

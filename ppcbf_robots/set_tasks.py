@@ -17,7 +17,7 @@ from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.problem import Problem, load_problem
-from ppcbf_robots.safe_sets import BoundaryCheck, Membership, check_boundary, membership
+from ppcbf_robots.safe_sets import FREE, VIABLE, BoundaryCheck, Membership, check_boundary, membership
 from ppcbf_robots.sweep import Task
 from ppcbf_robots.viable_set import Nodes, ViableSet
 
@@ -58,10 +58,11 @@ def known_barriers(problem: Problem, folders: Sequence[Path]) -> dict[str, Barri
     Raises:
         InputError: if a folder holds a barrier of another problem, or two have the same name.
     """
+    taken = (FREE, VIABLE)
     found: dict[str, Barrier] = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")}
     for folder in folders:
-        if folder.name in found:
-            raise InputError(f"--barrier: two folders are named '{folder.name}'; rename one")
+        if folder.name in (*found, *taken):
+            raise InputError(f"--barrier: there is another set named '{folder.name}'; rename the folder")
         found[folder.name] = load_barrier(folder).barrier(problem)
     return found
 

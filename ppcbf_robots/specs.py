@@ -188,7 +188,7 @@ def read_text(path: Path, what: str) -> str:
         raise InputError(f"{what} not found: {path}") from None
     except IsADirectoryError:
         raise InputError(f"{path} is a folder; give the path of a {what}") from None
-    except (UnicodeDecodeError, LookupError):
+    except (UnicodeError, LookupError):
         raise InputError(f"{path}: not a text file in UTF-8, nor in what its first line declares") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None

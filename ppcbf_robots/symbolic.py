@@ -2,7 +2,8 @@
 
 The articulated-body algorithm (Featherstone, *Rigid Body Dynamics Algorithms*, table 7.1) over joints of one degree of
 freedom. Motions are (linear, angular) as in Pinocchio; a joint's configuration is its angle or position, also where
-Pinocchio stores (cos, sin). Needs the extra ``study`` (casadi).
+Pinocchio stores (cos, sin). Needs casadi, of the extras
+``study`` and ``verify``.
 """
 
 from __future__ import annotations

@@ -58,7 +58,8 @@ class ViableSet:
         return RegularGridInterpolator(axes, loss, bounds_error=False, fill_value=np.nan)
 
     def value(self, q: Array, v: Array) -> Array:
-        """Least h that remains at best [m], (...), at q (..., nq) and v (..., nv); NaN beyond the grid."""
+        """Least h that remains at best [m], (...), at q (..., nq) and v (..., nv): viable where it is not
+        negative, NaN beyond the grid."""
         lead, robot = v.shape[:-1], self.safety.robot
         dyn = robot.evaluate_batch(q.reshape(-1, robot.nq), np.zeros((int(np.prod(lead, dtype=int)), robot.nv)))
         return self.value_from(self.safety.evaluate(dyn).h.min(-1).reshape(lead), q, v)
@@ -70,10 +71,6 @@ class ViableSet:
         low, turn = self.nodes.low, self.nodes.high - self.nodes.low
         x = np.where(turning, low + (x - low) % turn, x)
         return np.asarray(h + self._interpolator(x.reshape(-1, 4)).reshape(x.shape[:-1]))
-
-    def contains(self, q: Array, v: Array) -> NDArray[np.bool_]:
-        """Whether states are viable, (...): q (..., nq), v (..., nv); states beyond the grid count as not viable."""
-        return np.asarray(self.value(q, v) >= 0.0)
 
 
 def recall(key: str, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], int] | None:

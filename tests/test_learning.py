@@ -125,6 +125,31 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(cartpole, preset, tmp_path)
     assert dataclasses.astuple(result.check)[:3] == dataclasses.astuple(whole.check)[:3]
 
 
+def test_a_run_stopped_in_its_evidence_is_not_trained_on(two_link, tmp_path):
+    """The last check ended training early; its checkpoint says so."""
+    preset = dataclasses.replace(TINY, patience=1, iterations=400, refinements=0, judge_first=False)
+    trainer = Trainer(two_link, "pp-ncbf", preset)
+    whole = trainer.run(lambda monitor: save_checkpoint(trainer, tmp_path))
+    assert whole.steps < 400
+    resumed = Trainer(two_link, "pp-ncbf", preset)
+    load_checkpoint(resumed, tmp_path)
+    result = resumed.run()
+    assert result.steps == whole.steps
+    assert_same_weights(result.params, whole.params)
+
+
+def test_counterexamples_that_make_the_pool_overflow(cartpole, monkeypatch):
+    """Rays move then, and what is drawn from has to follow."""
+    monkeypatch.setattr(margin_descent_module, "POOL_GROWTH", 200)
+    descent = margin_descent(cartpole)
+    rng, domain = np.random.default_rng(0), cartpole.robot.domain
+    for _ in range(2):
+        q, v = cartpole.model.from_angles(domain.sample_q(rng, 290)), domain.sample_v(rng, 290)
+        descent.add_counterexamples(q, v)
+        assert max(descent._crossing.max(), descent._near.max()) < len(descent.rays)
+        descent.iterate()
+
+
 def test_a_resumed_run_still_has_the_barrier_that_stood_before_the_refinement(panda, monkeypatch, tmp_path):
     """Stopped hard while it refined for a larger set: the one that stands, and how often was refined, come back."""
     monkeypatch.setattr("ppcbf_robots.learning.train.check_band", lambda *a: BandCheck(300, 0, 300))

@@ -466,8 +466,8 @@ def test_a_urdf_in_the_encoding_that_it_declares(files):
     path = files(urdf="") / "arm.urdf"
     path.write_bytes(latin.encode("latin-1"))
     assert load_robot(str(path)).model.nv == 2
-    for wrong in (text.encode("latin-1"), latin.replace("ISO-8859-1", "no-such-code").encode("latin-1")):
-        path.write_bytes(wrong)
+    for wrong in (text, *(latin.replace("ISO-8859-1", code) for code in ("no-such-code", "undefined", "punycode"))):
+        path.write_bytes(wrong.encode("latin-1"))
         assert message(load_robot, str(path)) == (
             f"{path}: not a text file in UTF-8, nor in what its first line declares"
         )

@@ -120,6 +120,25 @@ def test_other_settings_are_other_tasks(cli, tmp_path):
     assert len(lines(tmp_path / "runs" / "results.jsonl")) == 3
 
 
+def test_a_barrier_of_other_settings_is_not_taken_for_that_of_a_result(cli, tmp_path):
+    """The folder holds the last training that went there."""
+    command = ["sweep", "--robots", "two_link", "--worlds", "circle", "--out", "runs"]
+    for iterations in (4, 5):
+        cli(*command, "--iterations", iterations)
+    again = cli(*command, "--iterations", 4)
+    assert again.code == 2
+    assert "two_link_circle_0: holds the barrier of another training than the results say; give" in again.stderr
+    assert cli(*command, "--iterations", 5).code in (0, 3)
+
+
+def test_a_task_knows_where_the_gamma_comes_from(two_link):
+    """A gamma that is given is kept, the same one by default gives way to the preset's."""
+    spec = type(two_link.robot.spec.barrier)
+    silent, given = (two_link.with_barrier_spec(x) for x in (spec(), spec(gamma=5.0)))
+    training = Training("r", "w", "default", PRESETS["default"], 0, 60.0)
+    assert training.task(silent).name != training.task(given).name
+
+
 def test_a_training_that_cannot_be_done_does_not_end_the_sweep(cli, tmp_path):
     ball = "{name: b, type: sphere, center: [5, 0, 5], radius: 7.07}"
     (tmp_path / "everywhere.yaml").write_text(f"obstacles: [{ball}]\n")
@@ -371,4 +390,5 @@ def test_a_task_is_known_by_all_that_its_outcome_depends_on(cartpole):
     for change in ({"seed": 1}, {"time_limit": 61.0}, {"preset": dataclasses.replace(PRESETS["default"], margin=0.5)}):
         names.add(dataclasses.replace(training, **change).task(cartpole).name)
     assert len(names) == 6
-    assert dataclasses.replace(training, folder=Path("x")).task(cartpole).name in names
+    with_barrier = {dataclasses.replace(training, folder=Path(x)).task(cartpole).name for x in ("a/x", "b/x")}
+    assert len(with_barrier) == 1 and not with_barrier & names  # a result without a barrier is no result here

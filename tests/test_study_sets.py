@@ -17,6 +17,7 @@ from ppcbf_robots.cli.main import app
 from ppcbf_robots.cli.study_nmpc import overlaps
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.nmpc import Settings, judge
+from ppcbf_robots.set_tasks import known_barriers
 
 DATA = Path(__file__).parent / "data"
 GANTRY = str(DATA / "gantry.yaml")
@@ -83,6 +84,12 @@ def test_bad_input_of_safe_set(tmp_path):
     out = ["--out", str(tmp_path)]
     assert "not a barrier folder" in refused("safe-set", GANTRY, "wall", "--barrier", str(tmp_path), *out)
     assert "expected 2 numbers" in refused("safe-set", GANTRY, "wall", "--velocity", "1", *out)
+
+
+def test_a_barrier_does_not_take_the_name_of_another_set(two_link, tmp_path):
+    for name in ("viable", "h >= 0", "LB-CBF"):
+        with pytest.raises(InputError, match=f"there is another set named '{name}'; rename the folder"):
+            known_barriers(two_link, [tmp_path / name])
 
 
 def test_missing_packages_are_named_with_the_remedy(tmp_path, monkeypatch):

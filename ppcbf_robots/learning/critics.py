@@ -1,6 +1,6 @@
 """Critics: how far a band state is from satisfying the torque box and passivity, without dimensions.
 
-``closed_form_critics`` are the paper's (17) and (18) for the correction (13); ``feasibility_margin`` is that of the
+``closed_form_critics`` are the paper's (17) and (18) for the correction (13); ``feasibility`` gives the margin of the
 runtime QP, exact for any number of rows. Positive margins are good, positive critics bad.
 """
 

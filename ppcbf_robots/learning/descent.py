@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,12 +13,11 @@ from ppcbf_robots.filters import FilterConfig
 from ppcbf_robots.learning.band import Band
 from ppcbf_robots.learning.falsifier import Attack
 from ppcbf_robots.learning.parameters import CONSTANTS, Tensors, initial_parameters
-from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.learning.presets import LearnedKind, Preset
 from ppcbf_robots.learning.rays import Rays, VolumeStates, build_pool, rays_at, to_tensors
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
 
-LearnedKind = Literal["ncbf", "pp-ncbf"]
 CHECK_STATES = 4_000
 VOLUME_STATES = 20_000  # uniform states of X on which the volume is measured
 LAST_RATE = 0.1  # of the learning rate, at the end of the planned iterations
@@ -63,7 +62,7 @@ class Descent(ABC):
 
     @property
     def refined(self) -> bool:
-        """Whether the evidence has asked for more than the first round."""
+        """Whether the evidence has asked for more iterations than were planned at first; an early end leaves some."""
         return self.planned > self.first_round
 
     @abstractmethod

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
+from ppcbf_robots.learning.descent import CHECK_STATES, Descent
 from ppcbf_robots.learning.falsifier import Attack, Falsifier, Starts
 from ppcbf_robots.learning.parameters import HELD, INSIDE, MANY_JOINTS, Tensors, before_softplus, without_term
-from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.learning.presets import LearnedKind, Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
@@ -214,6 +214,7 @@ class MarginDescent(Descent):
                 [torch.arange(self._first_pool, device=self.device), self._first_pool + order.sort().values]
             )
             self.rays, self._noted = self.rays.select(kept), self._noted[kept]
+            self._look()  # rays have moved
 
     def attack(self, params: dict[str, Array], known: Attack | None) -> Attack:
         """See :meth:`Descent.attack`; states that are known and violate these parameters too make a search needless."""
@@ -226,7 +227,7 @@ class MarginDescent(Descent):
         return self.falsifier.search(tensors, times * rounds, enough=ENOUGH, linger=LINGER * rounds)
 
     def add_counterexamples(self, q: Array, v: Array) -> None:
-        """Their rays join; they are looked at before the next iteration."""
+        """Their rays join, and are trained on from the next check on."""
         if len(q) > TAKEN:
             chosen = self.rng.choice(len(q), TAKEN, replace=False)
             q, v = q[chosen], v[chosen]

@@ -10,10 +10,10 @@ import torch
 from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.evidence import POWER_TOLERANCE
 from ppcbf_robots.learning.critics import closed_form_critics
-from ppcbf_robots.learning.descent import CHECK_STATES, Descent, LearnedKind
+from ppcbf_robots.learning.descent import CHECK_STATES, Descent
 from ppcbf_robots.learning.falsifier import Attack
 from ppcbf_robots.learning.parameters import Tensors
-from ppcbf_robots.learning.presets import Preset
+from ppcbf_robots.learning.presets import LearnedKind, Preset
 from ppcbf_robots.learning.rays import Rays
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array

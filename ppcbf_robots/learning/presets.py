@@ -10,7 +10,8 @@ from ppcbf_robots.filters import FilterKind, Metric
 from ppcbf_robots.network import NetworkKind
 from ppcbf_robots.problem import Problem
 
-PresetName = Literal["paper", "default"]
+PresetName = Literal["default", "paper"]
+LearnedKind = Literal["pp-ncbf", "ncbf"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Preset:
     critic_weight: float = 10.0  # closed form: initial λ of both constraints
     critic_growth: float = 1.01  # closed form: factor on λ after an iteration with violations
     critic_decay: float = 0.99  # closed form: factor on λ after one without
-    critic_bounds: tuple[float, float] = (1.0, 1000.0)  # closed form
+    critic_bounds: tuple[float, float] = (1.0, 10_000.0)  # closed form
     margin: float = 0.03  # dimensionless reserve the critics ask for in training; QP: for each joint but one
     random_goals: float = 0.0  # share of rays whose nominal torque aims at a random goal
     rays: int = 20_000
@@ -63,7 +64,6 @@ PAPER = Preset(
     learning_rate=3e-4,
     top=200,
     l2=1e-2,
-    critic_bounds=(1.0, 10_000.0),
     iterations=2_000,
     changes=(
         "K is zero at rest: K = (f(q, v) - f(q, 0))^2 instead of f(q, v)^2, which lets every resting posture stay safe",

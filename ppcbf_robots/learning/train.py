@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ppcbf_robots.evidence import BandCheck, check_band
-from ppcbf_robots.learning.descent import Descent, LearnedKind
+from ppcbf_robots.learning.descent import Descent
 from ppcbf_robots.learning.falsifier import Attack
 from ppcbf_robots.learning.margin_descent import MarginDescent
 from ppcbf_robots.learning.paper_descent import PaperDescent
 from ppcbf_robots.learning.parameters import without_term
-from ppcbf_robots.learning.presets import Preset, settings, with_gamma
+from ppcbf_robots.learning.presets import LearnedKind, Preset, settings, with_gamma
 from ppcbf_robots.network import NumpyNetwork
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.specs import Array
@@ -112,7 +112,7 @@ class Trainer:
         problem: robot, world and controller.
         kind: ``pp-ncbf`` trains for torque limits and passivity, ``ncbf`` for torque limits alone.
         preset: all settings.
-        seed: fixes every random draw; the same seed on the same machine gives the same weights.
+        seed: fixes every random draw; on the CPU, the same seed on the same machine gives the same weights.
         device: where the loop runs.
 
     Raises:
@@ -197,6 +197,8 @@ class Trainer:
     def _descend(self, on_check: Callable[[Monitor], None] | None, time_limit: float) -> None:
         """Lines 2 to 12 of Algorithm 1."""
         descent = self.descent
+        if self._settled():  # resumed after its last check
+            return
         while descent.iteration < descent.planned and time.monotonic() - self.started < time_limit:
             descent.iterate()
             if descent.iteration % self.preset.check_every == 0 or descent.iteration == descent.planned:

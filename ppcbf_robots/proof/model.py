@@ -44,24 +44,12 @@ class Program:
         return out
 
 
-class Layout:
-    """Where a problem's quantities stand among the outputs of its program."""
-
-    def __init__(self, rows: int, nv: int) -> None:
-        self.rows, self.nv = rows, nv
-        self.row = 3 + nv  # h, ḣ, drift and L_g rho of each row
-        self.Minv = rows * self.row
-        self.a0 = self.Minv + nv * nv
-        self.power = self.a0 + nv
-        self.u_rest = self.power + 1
-        self.size = self.u_rest + nv
-
-
 def row_program(problem: Problem, with_densities: bool = False) -> Program:
-    """Program of inputs (q, v), joint angles, and the outputs of :class:`Layout`.
+    """Program of inputs (q, v), joint angles, whose outputs are the rows' and the dynamics'.
 
-    Per row k: h, ``ḣ = ∇h v``, ``L_f rho = vᵀ ∇²h v + gamma ḣ - ∇h M⁻¹ b`` and ``L_g rho = ∇h M⁻¹``. Then M⁻¹,
-    ``-M⁻¹ b``, ``v · u_rest`` and u_rest, the nominal torque at rest; the passivity row is ``v · (u - u_rest) <= 0``.
+    Per row k, from output ``k (3 + nv)`` on: h, ``ḣ = ∇h v``, ``L_f rho = vᵀ ∇²h v + gamma ḣ - ∇h M⁻¹ b`` and
+    ``L_g rho = ∇h M⁻¹``. Then M⁻¹, ``-M⁻¹ b``, ``v · u_rest`` and u_rest, the nominal torque at rest; the passivity row
+    is ``v · (u - u_rest) <= 0``.
     ``with_densities`` adds factors (nv,) of each link's mass and inertia to the inputs, of which the controller and so
     u_rest know nothing.
 

@@ -16,17 +16,25 @@ def write_table(rows: Sequence[Row], folder: Path) -> list[Path]:
     """``table.csv`` with all digits and ``table.md`` for reading, of rows that have the same keys."""
     columns = list(rows[0])
     lines = [columns, ["---"] * len(columns), *([cell(row[c]) for c in columns] for row in rows)]
-    paths = [folder / "table.csv", folder / "table.md"]
+    write_csv(rows, folder / "table.csv")
+    path = folder / "table.md"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with paths[0].open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=columns)
+        path.write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return [folder / "table.csv", path]
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """Rows that have the same keys, these as columns; InputError where it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
-        paths[1].write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None
-    return paths
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def cell(value: Any) -> str:

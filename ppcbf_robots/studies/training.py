@@ -6,15 +6,29 @@ import dataclasses
 import hashlib
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ppcbf_robots.learning.presets import Preset, PresetName
+from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.errors import InputError
+from ppcbf_robots.learning.presets import Preset, PresetName, with_gamma
 from ppcbf_robots.problem import Problem, load_problem
+from ppcbf_robots.results_file import Record
 from ppcbf_robots.sweep import Task
 
 KIND: Final = "pp-ncbf"
+
+
+def check_folders(records: Sequence[Record], folders: Sequence[Path]) -> None:
+    """InputError if a folder does not hold the barrier of its record, as when another sweep has written there since."""
+    for record, folder in zip(records, folders, strict=True):
+        if "result" in record:
+            found, expected = load_barrier(folder).data["training"], record["result"]
+            if (found["steps"], found["seconds"]) != (expected["steps"], round(expected["seconds"], 2)):
+                raise InputError(f"{folder}: holds the barrier of another training than the results say; "
+                                 "give another --out")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -33,7 +47,8 @@ class Training:
         """The task of a sweep; its key holds all that the outcome depends on: robot, world and preset as a hash."""
         robot = problem.robot
         facts = [problem.fingerprint(), robot.start.tolist(), robot.start_velocity.tolist(), robot.goal.tolist(),
-                 robot.spec.barrier.model_dump(), dataclasses.asdict(self.preset)]  # fmt: skip
+                 with_gamma(problem, self.preset).robot.spec.barrier.model_dump(),
+                 dataclasses.asdict(self.preset)]  # fmt: skip
         key = {
             "robot": self.robot,
             "world": self.world,
@@ -42,6 +57,7 @@ class Training:
             "iterations": self.preset.iterations,
             "seed": self.seed,
             "time_limit": self.time_limit,
+            "folder": self.folder and self.folder.name,
             "identity": hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16],
         }
         return Task(key, self.run)
