@@ -227,7 +227,7 @@ def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
     title += f", {facts['barrier_kind']}, {facts['filter']}, {facts['engine']}" + "".join(f", {x}" for x in given)
     worst = facts["worst"]
     torque = f"(most {facts['max_torque_ratio']:.4f} of it, run {worst['torque']})"
-    injected = f"(run {worst['injected']}; median {facts['median_injected']:.2g})"
+    rise = f"(run {worst['largest_rise']}; median {facts['median_rise']:.2g})"
     rows = [
         ["runs with a contact", str(facts["contacts"])],
         ["runs beyond a torque limit", f"{facts['torque_violations']} {torque}"],
@@ -236,9 +236,9 @@ def _print(problem: Problem, facts: dict[str, Any], folder: Path) -> None:
         ["runs that diverged", str(facts["diverged"])],
         ["least h", f"{facts['min_h']:.6f} (run {worst['min_h']}; median of the runs {facts['median_min_h']:.4f})"],
         ["least clearance [m]", f"{facts['min_clearance']:.6f}"],
-        ["most energy above V0 and pushes [J]", f"{facts['max_energy_rise']:.3g}"],
-        ["the same as a share of V0", f"{facts['max_energy_share']:.2g}"],
-        ["most energy injected [J]", f"{facts['max_injected']:.3g} {injected}"],
+        ["most energy above V0 and pushes [J]", f"{facts['max_above_V0']:.3g}"],
+        ["the same as a share of V0", f"{facts['max_above_V0_share']:.2g}"],
+        ["largest rise of V [J]", f"{facts['max_rise']:.3g} {rise}"],
         ["steps without a solution", str(facts["qp_failures"])],
         ["steps below the full QP", str(facts["fallbacks"])],
         ["ended at the goal", str(facts["goals_reached"])],

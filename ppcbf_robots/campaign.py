@@ -142,11 +142,10 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     ``min_h`` (least h over all rows [m | rad]), ``clearance`` (over obstacles and self-collision pairs [m]),
     ``contact`` (where the engine knows contacts, of the links themselves; else a clearance below 0), ``beyond_limit``
     (a joint more than 0.1 mrad or mm beyond its limit), ``torque`` (largest |u_i| / u_max,i), ``rate`` (largest change
-    of torque over its limit, 0 without limits), ``energy_rise`` [J] (the most by which V exceeds V0 and the pushes'
-    work so far), ``energy_share`` (that, of V0), ``injected`` [J] (its largest rise over its running minimum, less that
-    work), ``push_work`` [J],
-    ``qp_failures`` (steps in which no torque satisfies all rows, or the solver gave none), ``fallbacks`` (steps below
-    the QP with all its rows), ``state`` (how the run ended, or ``diverged``), ``goal_error``.
+    of torque over its limit, 0 without limits), ``above_V0`` [J] (the most by which V exceeds V0 and the pushes'
+    work so far), ``above_V0_share`` (that, of V0), ``largest_rise`` [J] (of V less that work, over its running
+    minimum), ``push_work`` [J], ``qp_failures`` (steps in which no torque satisfies all rows, or the solver gave none),
+    ``fallbacks`` (steps below the QP with all its rows), ``state`` (how the run ended, or ``diverged``), ``goal_error``.
     """
     contacts, end = run.meta["contacts"], run.ending()
     known = np.isfinite(run.h) & np.isfinite(run.V) & np.isfinite(run.u).all(axis=1)  # not all of a run that diverges
@@ -165,9 +164,9 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
         "beyond_limit": bool(np.any(beyond)),
         "torque": float(np.max(np.abs(run.u[known]) / problem.model.u_max)),
         "rate": 0.0 if rates is None else float(rates[known[1:] & known[:-1]].max(initial=0.0)),
-        "energy_rise": rise,
-        "energy_share": rise / max(float(unexplained[0]), ENERGY_FLOOR),
-        "injected": float(np.max(unexplained - np.minimum.accumulate(unexplained))),
+        "above_V0": rise,
+        "above_V0_share": rise / max(float(unexplained[0]), ENERGY_FLOOR),
+        "largest_rise": float(np.max(unexplained - np.minimum.accumulate(unexplained))),
         "push_work": float(work[-1]),
         "qp_failures": failures,
         "fallbacks": sum(n for status, n in steps.items() if status >= Status.PASSIVITY_DROPPED),
@@ -188,7 +187,7 @@ def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
     """Figures of a campaign from those of its runs, by their numbers.
 
     ``contacts``, ``limit_violations``, ``torque_violations``, ``rate_violations`` and ``diverged`` count runs,
-    ``qp_failures`` and ``fallbacks`` control steps. ``worst`` holds the runs of least h, most energy and most torque.
+    ``qp_failures`` and ``fallbacks`` control steps. ``worst`` holds the runs of least h, largest rise and most torque.
     """
     runs = list(outcomes.values())
 
@@ -208,10 +207,10 @@ def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
         "diverged": states.count("diverged"),
         "qp_failures": sum(values("qp_failures")),
         "fallbacks": sum(values("fallbacks")),
-        "max_energy_rise": max(values("energy_rise")),
-        "max_energy_share": max(values("energy_share")),
-        "max_injected": max(values("injected")),
-        "median_injected": float(np.median(values("injected"))),
+        "max_above_V0": max(values("above_V0")),
+        "max_above_V0_share": max(values("above_V0_share")),
+        "max_rise": max(values("largest_rise")),
+        "median_rise": float(np.median(values("largest_rise"))),
         "min_h": min(values("min_h")),
         "median_min_h": float(np.median(values("min_h"))),
         "min_clearance": min(values("clearance")),
@@ -221,7 +220,11 @@ def total(outcomes: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
         "stalled": states.count("stalled"),
         "moving": states.count("moving"),
         "failed": sorted(index for index, run in outcomes.items() if _failed(run)),
-        "worst": {"min_h": worst("min_h", -1.0), "injected": worst("injected", 1.0), "torque": worst("torque", 1.0)},
+        "worst": {
+            "min_h": worst("min_h", -1.0),
+            "largest_rise": worst("largest_rise", 1.0),
+            "torque": worst("torque", 1.0),
+        },
     }
 
 

@@ -50,9 +50,9 @@ class Figures(BaseModel):
     min_h: float
     median_min_h: float
     min_clearance: float
-    max_energy_rise: float
-    max_energy_share: float
-    max_injected: float
+    max_above_V0: float
+    max_above_V0_share: float
+    max_rise: float
     max_torque_ratio: float
     failed: list[int]
 

@@ -202,9 +202,9 @@ def _campaign(m: Material) -> Section:
         ["least clearance", f"{facts['min_clearance']:.6f} m"],
         [
             "most energy above V0 and pushes",
-            f"{facts['max_energy_rise']:.3g} J ({facts['max_energy_share']:.2g} of V0)",
+            f"{facts['max_above_V0']:.3g} J ({facts['max_above_V0_share']:.2g} of V0)",
         ],
-        ["most energy injected", f"{facts['max_injected']:.3g} J"],
+        ["largest rise of V", f"{facts['max_rise']:.3g} J"],
         ["largest torque", f"{facts['max_torque_ratio']:.1%} of its limit"],
         ["control steps without a solution", str(facts["qp_failures"])],
         ["control steps below the full QP", str(facts["fallbacks"])],

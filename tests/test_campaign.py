@@ -171,8 +171,8 @@ def test_pushes_act_in_their_time_and_their_work_is_known(two_link):
     found = outcome(two_link, Case(q, np.zeros(2), q, pushes), run)
     assert abs(found["push_work"]) > 0.01
     assert found["push_work"] == pytest.approx(energy[-1] - energy[0], rel=1e-6)
-    assert found["injected"] < 1e-6
-    assert outcome(two_link, Case(q, np.zeros(2), q), run)["injected"] > 0.01
+    assert found["largest_rise"] < 1e-6
+    assert outcome(two_link, Case(q, np.zeros(2), q), run)["largest_rise"] > 0.01
 
 
 def test_what_goes_wrong_is_counted(two_link):
@@ -192,7 +192,7 @@ def test_what_goes_wrong_is_counted(two_link):
     assert not clean["beyond_limit"] and not found(h=good.h - 10.0 * bump)["contact"]
     assert found(q=good.q + 10.0 * bump[:, None])["beyond_limit"]  # whatever else is nearer
     assert found(u=good.u + 1e3 * bump[:, None])["torque"] > 1.0
-    assert found(V=good.V + 7.0 * bump)["injected"] == pytest.approx(7.0, abs=0.1)
+    assert found(V=good.V + 7.0 * bump)["largest_rise"] == pytest.approx(7.0, abs=0.1)
     failed = found(status=np.where(bump > 0, Status.INFEASIBLE, 0))
     assert (failed["qp_failures"], failed["fallbacks"]) == (1, 1)
     dropped = found(status=np.where(bump > 0, Status.PASSIVITY_DROPPED, 0))
@@ -286,7 +286,7 @@ def test_campaign_limits_the_torques_rate(tmp_path: Path, monkeypatch, capsys):
     assert run("two_link", "circle", *options, "--effort-rate", 500, "--out", tmp_path, monkeypatch=monkeypatch) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["effort_rate"] == 500.0 and facts["rate_violations"] == 0
-    assert 0.0 <= facts["max_energy_share"] < 1e-3
+    assert 0.0 <= facts["max_above_V0_share"] < 1e-3
     worst = Trajectory.load(tmp_path / "worst.npz")
     assert np.max(np.abs(np.diff(worst.u, axis=0))) <= 0.5 * (1.0 + 1e-9)
     assert np.max(np.abs(np.diff(worst.u, axis=0))) > 0.01
