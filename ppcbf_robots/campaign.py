@@ -145,7 +145,7 @@ def outcome(problem: Problem, case: Case, run: Trajectory) -> dict[str, Any]:
     of torque over its limit, 0 without limits), ``above_V0`` [J] (the most by which V exceeds V0 and the pushes'
     work so far), ``above_V0_share`` (that, of V0), ``largest_rise`` [J] (of V less that work, over its running
     minimum), ``push_work`` [J], ``qp_failures`` (steps in which no torque satisfies all rows, or the solver gave none),
-    ``fallbacks`` (steps below the QP with all its rows), ``state`` (how the run ended, or ``diverged``), ``goal_error``.
+    ``fallbacks`` (steps below the QP with all its rows), ``state`` (how it ended, or ``diverged``), ``goal_error``.
     """
     contacts, end = run.meta["contacts"], run.ending()
     known = np.isfinite(run.h) & np.isfinite(run.V) & np.isfinite(run.u).all(axis=1)  # not all of a run that diverges
