@@ -147,36 +147,32 @@ class Trainer:
         The LB-CBF, whose set is the largest, is judged first where the preset says so: it may need no learned term.
         KeyboardInterrupt ends training and judges the best barrier so far.
         """
-        interrupted = False
-        while True:
-            at_once = self.round < 0
+        interrupted = over = False
+        if self.round < 0:
             try:
-                if at_once:
-                    self.clean = [(1.0, without_term(self.descent.snapshot()))]
-                else:
-                    self._descend(on_check, time_limit)
+                over = self._lb_stands() or self._late(time_limit)
+            except KeyboardInterrupt:
+                interrupted = True
+        while not (over or interrupted):
+            try:
+                self._descend(on_check, time_limit)
             except KeyboardInterrupt:
                 interrupted = True
             try:
                 found = self._evidence()
             except KeyboardInterrupt:
                 found, interrupted = [], True
-            kept = [t for t in found if self._stands(t, 1.0)] if at_once else found  # else its search was cut short
-            candidates = kept if self.best is None else [self.best, *kept]
-            self.best = min(candidates, key=lambda t: (not self._stands(t), *t.order), default=None)
-            out_of_time = time.monotonic() - self.started > time_limit
-            best = self.best
+            candidates = found if self.best is None else [self.best, *found]
+            best = self.best = min(candidates, key=lambda t: (not self._stands(t), *t.order), default=None)
             enough = best is not None and self._stands(best)
             self.gained += enough
             larger = best is not None and any(t.volume_kept > best.volume_kept for t in found)  # that did not stand
             last = self.round == self.preset.refinements or (enough and not (larger and self.gained <= GAIN_ROUNDS))
-            collapsed = not enough and not at_once and self.descent.volume_kept() < self.preset.min_volume
-            if last or interrupted or out_of_time or collapsed:  # a refinement of what has collapsed only shrinks it
+            collapsed = not enough and self.descent.volume_kept() < self.preset.min_volume  # refined, it only shrinks
+            over = last or collapsed or self._late(time_limit)
+            if over or interrupted:
                 break
             self.round += 1
-            if at_once:
-                self._join(found)
-                continue
             self._refine(found, demanding=not enough)
             if on_refine is not None:
                 wrong = _said(found[0]) if found else "no clean barrier was found"
@@ -184,11 +180,27 @@ class Trainer:
         unknown = Tested(self.descent.snapshot(), BandCheck(0, 0, 0), None, 0.0)
         return self._result(self.best or unknown, interrupted)
 
+    def _lb_stands(self) -> bool:
+        """Whether the LB-CBF passes the evidence with all the reserve that training asks for; else what was found joins.
+
+        Nothing of it was trained: where less is left, a short search was lucky.
+        """
+        self.clean = [(1.0, without_term(self.descent.snapshot()))]
+        found = self._evidence()
+        self.best = next((t for t in found if self._stands(t, 1.0)), None)
+        if self.best is None:
+            self.round = 0
+            self._join(found)
+        return self.best is not None
+
+    def _late(self, time_limit: float) -> bool:
+        """Whether time is up."""
+        return time.monotonic() - self.started > time_limit
+
     def _stands(self, tested: Tested, share: float = RESERVE_SHARE) -> bool:
         """Whether it is clean and, where states cannot be covered, keeps that share of the reserve training asks for.
 
-        What an arm's set has left of a short search by luck, a longer one takes: the LB-CBF, of which nothing was
-        trained, has to have all that training asks for.
+        What an arm's set has left of a short search by luck, a longer one takes.
         """
         covered = self.problem.model.nv <= self.preset.covered_joints
         ample = covered or tested.attack is None or tested.attack.worst >= share * self.descent.margin
@@ -199,7 +211,7 @@ class Trainer:
         descent = self.descent
         if self._settled():  # resumed after its last check
             return
-        while descent.iteration < descent.planned and time.monotonic() - self.started < time_limit:
+        while descent.iteration < descent.planned and not self._late(time_limit):
             descent.iterate()
             if descent.iteration % self.preset.check_every == 0 or descent.iteration == descent.planned:
                 monitor = self._check()
@@ -281,7 +293,7 @@ class Trainer:
         check, descent = best.check, self.descent
         descent.load(best.params)
         volume = descent.volume_kept()
-        start_inside = self._start_inside(best.params)
+        start_inside, converged = self._start_inside(best.params), False
         if volume < self.preset.min_volume:
             reason = f"collapsed: the safe set keeps {volume:.1%} of the LB set"
         elif best.attack is not None and best.attack.worst < 0.0:
@@ -295,8 +307,8 @@ class Trainer:
         elif not start_inside and self.problem.safety.least(self.problem.robot.start)[0] >= 0.0:
             reason = "the start state lies outside the safe set"
         else:
+            converged = True
             reason = "interrupted; the best barrier so far is clean" if interrupted else "clean"
-        converged = reason == "clean" or reason.startswith("interrupted")
         seconds = time.monotonic() - self.started
         return Result(best.params, converged, reason, volume, check, best.attack, start_inside, descent.iteration,
                       seconds, self.history, interrupted)  # fmt: skip
