@@ -14,7 +14,6 @@ import numpy as np
 from ppcbf_robots.artefact import StoredBarrier, load_barrier
 from ppcbf_robots.band_statistics import (
     CONDITIONS,
-    KEPT,
     BandCounts,
     clopper_pearson,
     count_violations,
@@ -26,6 +25,7 @@ from ppcbf_robots.results_file import Record
 from ppcbf_robots.sweep import Task
 
 CHUNK = 2_500  # states per task
+JUDGED = 2_000  # states of an attack that the filter looks at: the last ones, which the search has deepened
 STATEMENTS = {
     "input_bounds": "the filter's torque lies within the limits",
     "feasibility": "a torque within the limits satisfies all rows",
@@ -91,7 +91,7 @@ def _attack(job: BandJob, index: int, seconds: float) -> dict[str, Any]:
     problem, stored = job.load()
     barrier, config = stored.barrier(problem), stored.filter_config()
     found = falsify(problem, barrier, config, job.rng(1, index), seconds)
-    counts = count_violations(problem, barrier, config, stored.kind == "pp-ncbf", found.q[:KEPT], found.v[:KEPT])
+    counts = count_violations(problem, barrier, config, stored.kind == "pp-ncbf", found.q[-JUDGED:], found.v[-JUDGED:])
     worst = float(found.worst) if math.isfinite(found.worst) else None
     searched = {"samples": 0, "worst_margin": worst, "evaluated": found.evaluated}
     return {**asdict(counts), **searched, "seconds": time.monotonic() - began}
