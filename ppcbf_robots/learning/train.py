@@ -181,7 +181,7 @@ class Trainer:
         return self._result(self.best or unknown, interrupted)
 
     def _lb_stands(self) -> bool:
-        """Whether the LB-CBF passes the evidence with all the reserve that training asks for; else what was found joins.
+        """Whether the LB-CBF passes the evidence with all the reserve that is asked for; else what was found joins.
 
         Nothing of it was trained: where less is left, a short search was lucky.
         """
