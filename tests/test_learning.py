@@ -627,6 +627,17 @@ def test_the_rate_warms_up_for_a_refinement(two_link):
     assert [rate(i, 150) for i in (100, 125, 149)] == pytest.approx([0.4, 0.2, 0.1])
 
 
+def test_the_papers_exit_ends_training_where_its_critics_are_small(cartpole):
+    """As the critics stand, not as the weights make them; the default is to leave the end to the evidence."""
+    never, always, at_first = (
+        Trainer(cartpole, "pp-ncbf", dataclasses.replace(TINY_PAPER, exit=exit_at, iterations=6, refinements=0)).run()
+        for exit_at in (0.0, 10.0, 0.2)
+    )
+    assert (never.steps, never.ended) == (6, False)
+    assert (always.steps, always.ended, len(always.history)) == (1, True, 1)
+    assert at_first.ended == (at_first.steps < 6)
+
+
 def test_the_report_of_a_clean_run_names_the_attack(two_link):
     _, result = train(two_link)
     report = result.report()

@@ -281,12 +281,19 @@ def test_the_study_of_variability(cli, tmp_path):
 
 
 def record(
-    rate: float, converged: bool, reason: str = "clean", steps: int = 400, first_clean: int = 100, volume: float = 0.9
+    rate: float,
+    converged: bool,
+    reason: str = "clean",
+    steps: int = 400,
+    first_clean: int = 100,
+    volume: float = 0.9,
+    ended: bool | None = None,
 ) -> dict[str, Any]:
-    history = [{"iteration": i, "clean": i >= first_clean} for i in range(50, steps + 1, 50)]
+    history = [{"iteration": i, "clean": i >= first_clean, "torque": 0.01, "passivity": 0.03}
+               for i in range(50, steps + 1, 50)]  # fmt: skip
     result = {"converged": converged, "reason": reason, "steps": steps, "seconds": steps / 200, "volume_kept": volume,
-              "history": history}  # fmt: skip
-    return {"key": {"preset": "paper", "learning_rate": rate}, "result": result}
+              "history": history, "ended": bool(ended)}  # fmt: skip
+    return {"key": {"preset": "paper", "learning_rate": rate, "exit": 0.0 if ended is None else 0.01}, "result": result}
 
 
 def test_convergence_counts_and_means():
@@ -297,9 +304,18 @@ def test_convergence_counts_and_means():
     )  # fmt: skip
     assert rows[0] == {"preset": "paper", "rate": 1e-5, "runs": 4, "converged": 0.5, "collapsed": 0.25,
                        "clean_once": 0.75, "first_clean": pytest.approx(400 / 3), "steps": 500, "seconds": 2.25,
-                       "volume_least": 0.1, "volume_most": 0.9, "paper_share": 1.0, "paper_steps": 400}  # fmt: skip
+                       "violating": pytest.approx(0.04), "volume_least": 0.1, "volume_most": 0.9, "paper_share": 1.0, "paper_steps": 400}  # fmt: skip
     assert (rows[1]["converged"], rows[1]["collapsed"], rows[1]["steps"]) == (0.0, 1.0, None)
     assert (rows[1]["clean_once"], rows[1]["first_clean"]) == (0.0, None)
+
+
+def test_with_the_papers_exit_those_converge_that_reach_it_and_have_not_collapsed():
+    """What the evidence says of them does not count: most violate still."""
+    runs = [record(1e-5, False, "3 violate", ended=True), record(1e-5, False, "collapsed: ...", ended=True),
+            record(1e-5, True, ended=False), record(1e-5, False, "3 violate", steps=600, ended=True)]  # fmt: skip
+    row, other = convergence_rows([*runs, record(1e-5, True)])
+    assert (row["converged"], row["collapsed"], row["steps"], row["runs"]) == (0.5, 0.25, 500, 4)
+    assert (other["converged"], other["runs"]) == (1.0, 1)
 
 
 def test_the_papers_table():

@@ -58,6 +58,7 @@ class Descent(ABC):
         self.iteration, self.planned = 0, preset.iterations
         self.first_round = self.planned  # iterations before any refinement
         self.evaluated = 0  # band states whose critics were computed in iterations
+        self.ended = False  # whether the preset's exit was reached
         self.loss: float | torch.Tensor = float("nan")  # of the last step
 
     @property

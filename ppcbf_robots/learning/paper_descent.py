@@ -64,14 +64,15 @@ class PaperDescent(Descent):
         """One gradient step on the loss (24) with R = 1 - sigmoid(phi), then the weights' update."""
         p = self.preset
         R = 1.0 - torch.sigmoid(phi)
-        C = self.weights[0] * torque + self.weights[1] * passivity
+        C, top = self.weights[0] * torque + self.weights[1] * passivity, min(p.top, len(phi))
         matrices = [w for k, w in self.params.items() if k.startswith("W")]
         l2 = sum(((w * w).mean() for w in matrices), start=torch.zeros((), device=self.device))
-        loss = p.volume_weight * R.mean() + C.topk(min(p.top, len(C))).values.mean() + p.l2 * l2
+        loss = p.volume_weight * R.mean() + C.topk(top).values.mean() + p.l2 * l2
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.loss = float(loss.detach())
+        self.ended = bool((torque + passivity).detach().topk(top).values.mean() < p.exit)
         for j, critic in enumerate((torque, passivity)):
             violated = float((critic > 0.0).float().mean()) > VIOLATED
             factor = p.critic_growth if violated else p.critic_decay

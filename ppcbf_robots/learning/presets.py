@@ -29,6 +29,7 @@ class Preset:
     samples: int = 1000  # N, new band states per iteration
     epochs: int = 1  # closed form: E, gradient steps per iteration
     top: int = 100  # closed form: k of Top_k
+    exit: float = 0.0  # closed form: the paper's ξ, mean of the Top_k critics without λ below which training ends
     l2: float = 0.0  # closed form: weight of the L2 penalty (mean square of the weights)
     simplicity: float = 0.0  # QP: weight of the mean square of the rate of K along the motion
     volume_weight: float = 1.0  # of the regularisation term R, eq. (16); QP: its largest, over nv

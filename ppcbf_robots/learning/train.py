@@ -64,6 +64,7 @@ class Result:
     seconds: float
     history: list[Monitor]
     interrupted: bool  # by Ctrl-C
+    ended: bool  # by the preset's exit
 
     def report(self) -> dict[str, Any]:
         """The keys of ``ppcbf train --json``, without the folder."""
@@ -213,11 +214,12 @@ class Trainer:
             return
         while descent.iteration < descent.planned and not self._late(time_limit):
             descent.iterate()
-            if descent.iteration % self.preset.check_every == 0 or descent.iteration == descent.planned:
+            last = descent.ended or descent.iteration == descent.planned
+            if last or descent.iteration % self.preset.check_every == 0:
                 monitor = self._check()
                 if on_check is not None:
                     on_check(monitor)
-                if self._settled():
+                if last or self._settled():
                     break
 
     def _check(self) -> Monitor:
@@ -311,7 +313,7 @@ class Trainer:
             reason = "interrupted; the best barrier so far is clean" if interrupted else "clean"
         seconds = time.monotonic() - self.started
         return Result(best.params, converged, reason, volume, check, best.attack, start_inside, descent.iteration,
-                      seconds, self.history, interrupted)  # fmt: skip
+                      seconds, self.history, interrupted, descent.ended)  # fmt: skip
 
 
 def _said(tested: Tested) -> str:

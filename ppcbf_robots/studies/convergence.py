@@ -15,19 +15,22 @@ TABLE_1 = {1e-3: (0.0, None), 1e-4: (0.7, 150), 5e-5: (0.85, 200), 1e-5: (1.0, 4
 def convergence_rows(records: Sequence[Record]) -> list[Row]:
     """One row per preset and learning rate, in their first order, of records with results.
 
-    ``clean_once`` is the share of runs with a check without violations, ``first_clean`` the iteration of the first such
-    check, a mean over these. ``steps`` are those to the end of the converged runs, a mean; ``seconds`` the mean and
-    ``volume_least`` and ``volume_most`` the range over all runs, of the LB set's volume.
+    ``converged`` are the runs whose set the evidence passes or, where the paper's exit ends them (``key["exit"]``),
+    those that reach it and have not collapsed; ``steps`` is their mean iteration at the end. ``clean_once`` is the share
+    of runs with a check without violations, ``first_clean`` the mean iteration of the first such check. Over all runs,
+    ``seconds`` is the mean, ``violating`` the mean share of fresh band states that violate at the last check, and
+    ``volume_least`` and ``volume_most`` the range of the LB set's volume kept.
     """
-    groups: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    groups: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
     for record in records:
-        key = record["key"]["preset"], record["key"]["learning_rate"]
+        key = record["key"]["preset"], record["key"]["learning_rate"], record["key"]["exit"]
         groups.setdefault(key, []).append(record["result"])
-    return [_row(preset, rate, results) for (preset, rate), results in groups.items()]
+    return [_row(*key, results) for key, results in groups.items()]
 
 
-def _row(preset: str, rate: float, results: list[dict[str, Any]]) -> Row:
-    converged = [r for r in results if r["converged"]]
+def _row(preset: str, rate: float, exit_at: float, results: list[dict[str, Any]]) -> Row:
+    collapsed = [r for r in results if r["reason"].startswith("collapsed")]
+    converged = [r for r in results if (r["ended"] and r not in collapsed if exit_at else r["converged"])]
     first_clean = [i for r in results for i in _clean_checks(r)[:1]]
     volumes = [r["volume_kept"] for r in results]
     paper_share, paper_steps = TABLE_1.get(rate, (None, None))
@@ -38,9 +41,10 @@ def _row(preset: str, rate: float, results: list[dict[str, Any]]) -> Row:
         "clean_once": len(first_clean) / len(results),
         "first_clean": mean(first_clean),
         "converged": len(converged) / len(results),
-        "collapsed": sum(r["reason"].startswith("collapsed") for r in results) / len(results),
+        "collapsed": len(collapsed) / len(results),
         "steps": mean([r["steps"] for r in converged]),
         "seconds": mean([r["seconds"] for r in results]),
+        "violating": mean([m["torque"] + m["passivity"] for r in results for m in r["history"][-1:]]),
         "volume_least": min(volumes),
         "volume_most": max(volumes),
         "paper_share": paper_share,

@@ -55,6 +55,7 @@ class Training:
             "preset": self.preset_name,
             "learning_rate": self.preset.learning_rate,
             "iterations": self.preset.iterations,
+            "exit": self.preset.exit,
             "seed": self.seed,
             "time_limit": self.time_limit,
             "folder": self.folder and self.folder.name,
@@ -81,6 +82,7 @@ class Training:
             "violations": result.check.violations,
             "samples": result.check.samples,
             "steps": result.steps,
+            "ended": result.ended,
             "seconds": result.seconds,
             "history": [
                 {
