@@ -304,7 +304,8 @@ def test_convergence_counts_and_means():
     )  # fmt: skip
     assert rows[0] == {"preset": "paper", "rate": 1e-5, "runs": 4, "converged": 0.5, "collapsed": 0.25,
                        "clean_once": 0.75, "first_clean": pytest.approx(400 / 3), "steps": 500, "seconds": 2.25,
-                       "violating": pytest.approx(0.04), "volume_least": 0.1, "volume_most": 0.9, "paper_share": 1.0, "paper_steps": 400}  # fmt: skip
+                       "violating": pytest.approx(0.04), "volume_least": 0.1, "volume_most": 0.9,
+                       "paper_share": 1.0, "paper_steps": 400}  # fmt: skip
     assert (rows[1]["converged"], rows[1]["collapsed"], rows[1]["steps"]) == (0.0, 1.0, None)
     assert (rows[1]["clean_once"], rows[1]["first_clean"]) == (0.0, None)
 

@@ -16,9 +16,9 @@ def convergence_rows(records: Sequence[Record]) -> list[Row]:
     """One row per preset and learning rate, in their first order, of records with results.
 
     ``converged`` are the runs whose set the evidence passes or, where the paper's exit ends them (``key["exit"]``),
-    those that reach it and have not collapsed; ``steps`` is their mean iteration at the end. ``clean_once`` is the share
-    of runs with a check without violations, ``first_clean`` the mean iteration of the first such check. Over all runs,
-    ``seconds`` is the mean, ``violating`` the mean share of fresh band states that violate at the last check, and
+    those that reach it and have not collapsed; ``steps`` is their mean iteration at the end. ``clean_once`` is the
+    share of runs with a check without violations, ``first_clean`` the mean iteration of the first such check. Over all
+    runs, ``seconds`` is the mean, ``violating`` the mean share of fresh band states that violate at the last check, and
     ``volume_least`` and ``volume_most`` the range of the LB set's volume kept.
     """
     groups: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
