@@ -51,17 +51,17 @@ def clopper_pearson(violations: int, samples: int, confidence: float) -> float:
 
 
 def independent_band(
-    problem: Problem, barrier: Barrier, count: int, rng: np.random.Generator
+    problem: Problem, barrier: Barrier, count: int, rng: np.random.Generator, width: float | None = None
 ) -> tuple[Array, Array, int]:
-    """Independent states, uniform on ``{0 <= min_k phi_k <= epsilon, h >= 0}`` in X: q (n, nq), v (n, nv), tried.
+    """Independent states, uniform on ``{0 <= min_k phi_k <= width, h >= 0}`` in X: q (n, nq), v (n, nv), tried.
 
-    Plain rejection: every state of X is drawn anew, position and velocity, and kept if it lies on the band. (In
-    :func:`ppcbf_robots.evidence.uniform_band` several states may share a position.)
+    ``width`` is epsilon by default. Plain rejection: every state of X is drawn anew, position and velocity, and kept if
+    it lies on the band. (In :func:`ppcbf_robots.evidence.uniform_band` several states may share a position.)
 
     Raises:
         CheckFailed: if X seems to hold no state of the band.
     """
-    model, domain, epsilon = problem.model, problem.robot.domain, barrier.spec.epsilon
+    model, domain, epsilon = problem.model, problem.robot.domain, barrier.spec.epsilon if width is None else width
     kept_q: list[Array] = []
     kept_v: list[Array] = []
     found = tried = 0

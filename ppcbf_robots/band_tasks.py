@@ -20,6 +20,7 @@ from ppcbf_robots.band_statistics import (
     independent_band,
 )
 from ppcbf_robots.certificate import Condition, Verdict
+from ppcbf_robots.filters import band_width
 from ppcbf_robots.problem import Problem, load_problem
 from ppcbf_robots.results_file import Record
 from ppcbf_robots.sweep import Task
@@ -74,8 +75,10 @@ def _sample(job: BandJob, chunk: int, count: int) -> dict[str, Any]:
     began = time.monotonic()
     problem, stored = job.load()
     barrier = stored.barrier(problem)
-    q, v, tried = independent_band(problem, barrier, count, job.rng(0, chunk))
-    counts = count_violations(problem, barrier, stored.filter_config(), stored.kind == "pp-ncbf", q, v)
+    config = stored.filter_config()
+    width = band_width(barrier.spec, config.kind)
+    q, v, tried = independent_band(problem, barrier, count, job.rng(0, chunk), width)
+    counts = count_violations(problem, barrier, config, stored.kind == "pp-ncbf", q, v)
     counts.tried = tried
     return {**asdict(counts), "seconds": time.monotonic() - began}
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ppcbf_robots.barriers import Barrier
-from ppcbf_robots.filters import FilterConfig, Status
+from ppcbf_robots.filters import FilterConfig, Status, band_width
 from ppcbf_robots.problem import Problem
 from ppcbf_robots.safety_filter import SafetyFilter
 from ppcbf_robots.specs import Array
@@ -40,13 +40,16 @@ def uniform_band(
     count: int,
     rng: np.random.Generator,
     max_configurations: int = MAX_CONFIGURATIONS,
+    width: float | None = None,
 ) -> tuple[Array, Array, int]:
-    """States uniform on ``{0 <= min_k phi_k <= epsilon, h >= 0}`` by rejection: q (n, nq), v (n, nv), states tried.
+    """States uniform on ``{0 <= min_k phi_k <= width, h >= 0}`` by rejection: q (n, nq), v (n, nv), states tried.
+
+    ``width`` is epsilon by default.
 
     Every configuration is tried with 20 velocities, so states may share a configuration. Fewer than ``count`` come back
     when the band is too thin.
     """
-    model, domain, eps = problem.model, problem.robot.domain, barrier.spec.epsilon
+    model, domain, eps = problem.model, problem.robot.domain, barrier.spec.epsilon if width is None else width
     found_q: list[Array] = []
     found_v: list[Array] = []
     found = tried = 0
@@ -122,7 +125,8 @@ def check_band(
     largest power u_max · v_max: near rest the paper's condition cannot hold exactly. QP: no torque in the box satisfies
     all rows with the passivity row (without it if not ``passive``).
     """
-    q, v, tried = uniform_band(problem, barrier, count, rng, max_configurations)
+    width = band_width(barrier.spec, config.kind)
+    q, v, tried = uniform_band(problem, barrier, count, rng, max_configurations, width)
     runtime = SafetyFilter(problem.model, problem.safety, barrier, config)
     u_max = problem.model.u_max
     power_tolerance = POWER_TOLERANCE * float(u_max @ np.abs(problem.robot.domain.v).max(axis=1))

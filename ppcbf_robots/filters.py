@@ -16,7 +16,7 @@ import numpy as np
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.kernels import kernel
 from ppcbf_robots.robot import RobotModel
-from ppcbf_robots.specs import Array
+from ppcbf_robots.specs import Array, BarrierSpec
 
 Metric = Literal["torque", "kinetic"]
 FilterKind = Literal["closed-form", "qp"]
@@ -101,6 +101,11 @@ def stays_slow(v: Any, Minv: Any, b: Any, u: Any, ahead: float, slow: Any) -> bo
             then += ahead * Minv[i, j] * (u[j] - b[j])
         found = found and abs(v[i]) <= slow[i] and abs(then) <= slow[i]
     return found
+
+
+def band_width(spec: BarrierSpec, kind: FilterKind) -> float:
+    """Largest phi [m/s] of the states that a filter of this kind is trained and checked on: where it acts."""
+    return spec.acting_width if kind == "closed-form" else spec.epsilon
 
 
 def free_power(robot: RobotModel) -> float:

@@ -98,6 +98,11 @@ class BarrierSpec(Spec):
     epsilon: Positive = 0.05  # [m/s], width of the band of eq. (21)
     act_within: Positive | None = None  # [m]: closed form acts where h <= this, too
 
+    @property
+    def acting_width(self) -> float:
+        """Largest phi [m/s] at which the closed form acts on a row that does not separate."""
+        return self.epsilon if self.act_within is None else max(self.epsilon, self.gamma * self.act_within)
+
 
 class SelfCollisionSpec(Spec):
     """Body spheres must not touch each other, but for neighbours and links whose collision the SRDF disables."""

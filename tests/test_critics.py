@@ -38,12 +38,13 @@ def network(request, problem, random_network) -> NumpyNetwork:
 # The closed form
 
 
-@pytest.fixture
-def on_band(problem, network) -> tuple[Problem, Rays, torch.Tensor, BarrierRows]:
-    """A problem whose closed form acts on phi, rays, s and rows of states on the band."""
-    spec = problem.robot.spec.barrier.model_copy(update={"act_within": None})
+@pytest.fixture(params=[(None, 0.025), (0.03, 0.1)], ids=["by phi", "by h"])
+def on_band(request, problem, network) -> tuple[Problem, Rays, torch.Tensor, BarrierRows]:
+    """A problem whose closed form acts on phi, or on some near rows above the band; rays, s and rows of states there."""
+    act_within, level = request.param
+    spec = problem.robot.spec.barrier.model_copy(update={"act_within": act_within})
     field, rays = make_field(problem, network.kind), make_rays(problem, 600)
-    found, s = field.on_band(tensors(network.params), rays, torch.full((len(rays),), 0.025, dtype=DOUBLE))
+    found, s = field.on_band(tensors(network.params), rays, torch.full((len(rays),), level, dtype=DOUBLE))
     rays = rays.select(found)
     return problem.with_barrier_spec(spec), rays, s, field.rows(tensors(network.params), rays, s)
 
@@ -55,8 +56,9 @@ def test_closed_form_critics_are_the_runtime_filters_excess(on_band, network, me
     kd, p_ref = torch.as_tensor(problem.robot.controller.gains.kd), 17.0
     v = s[:, None] * rays.d
     found = closed_form_critics(
-        rows, v, rays.u_rest - kd * v, (kd * v * v).sum(-1), torch.as_tensor(u_max), metric, 0.0, p_ref
-    )
+        rows, v, rays.u_rest - kd * v, (kd * v * v).sum(-1), torch.as_tensor(u_max), metric, 0.0, p_ref,
+        problem.robot.spec.barrier,
+    )  # fmt: skip
     barrier = problem.barrier("pp-ncbf", network)
     filter_ = ClosedForm(barrier, FilterConfig("closed-form", metric))
     expected = []
@@ -75,7 +77,9 @@ def test_closed_form_critics_ask_for_a_reserve(on_band):
     problem, rays, s, rows = on_band
     kd, v = torch.as_tensor(problem.robot.controller.gains.kd), s[:, None] * rays.d
     arguments = (rows, v, rays.u_rest - kd * v, (kd * v * v).sum(-1), torch.as_tensor(problem.model.u_max), "torque")
-    without, with_ = (closed_form_critics(*arguments, margin, 1.0) for margin in (0.0, 0.03))
+    without, with_ = (
+        closed_form_critics(*arguments, margin, 1.0, problem.robot.spec.barrier) for margin in (0.0, 0.03)
+    )
     for less, more in zip(without, with_, strict=True):
         assert torch.all(more >= less)
     over = without[0] > 0.0

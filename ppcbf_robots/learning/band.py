@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from ppcbf_robots.filters import FilterConfig, free_power
+from ppcbf_robots.filters import FilterConfig, band_width, free_power
 from ppcbf_robots.learning.critics import Feasibility, feasibility
 from ppcbf_robots.learning.rays import Field, Rays
 from ppcbf_robots.network import NetworkKind, Params
@@ -42,7 +42,8 @@ class Band:
     ) -> None:  # fmt: skip
         model, spec = problem.model, problem.robot.spec.barrier
         self.field = Field(model, network, spec.gamma, device, dtype)
-        self.config, self.passive, self.epsilon = config, passive, spec.epsilon
+        self.config, self.passive, self.epsilon = config, passive, band_width(spec, config.kind)
+        self.spec = spec
         self.u_max = torch.as_tensor(model.u_max, device=device, dtype=dtype)
         self.kd = torch.as_tensor(problem.robot.controller.gains.kd, device=device, dtype=dtype)
         self.free_power = free_power(model)

@@ -13,15 +13,16 @@ import torch
 from ppcbf_robots.barriers import BarrierRows
 from ppcbf_robots.filters import FilterConfig, Metric
 from ppcbf_robots.learning.linear_program import Optimum, best_worst_row
+from ppcbf_robots.specs import BarrierSpec
 
 _TINY = 1e-9
 LEAST_CAPABILITY = 1e-3  # two rows that brake each other exactly leave none
 PASSIVITY_RESERVE = 0.01  # of |v| |u_sc|; more of it fights the torque critic
 
 
-def least_row(rows: BarrierRows) -> BarrierRows:
-    """The row of least phi of every state, keeping an axis of length 1."""
-    k = rows.phi.argmin(-1, keepdim=True)
+def least_row(rows: BarrierRows, among: Any) -> BarrierRows:
+    """The row of least phi of every state, ``among`` some (B, R), keeping an axis of length 1."""
+    k = torch.where(among, rows.phi, torch.inf).argmin(-1, keepdim=True)
     wide = k[..., None].expand(-1, -1, rows.Lg_phi.shape[-1])
     return BarrierRows(
         rows.h.gather(-1, k),
@@ -34,20 +35,25 @@ def least_row(rows: BarrierRows) -> BarrierRows:
 
 
 def closed_form_critics(
-    rows: BarrierRows, v: Any, u_des: Any, d_p: Any, u_max: Any, metric: Metric, margin: float, p_ref: float
-) -> tuple[Any, Any]:
+    rows: BarrierRows, v: Any, u_des: Any, d_p: Any, u_max: Any, metric: Metric, margin: float, p_ref: float,
+    spec: BarrierSpec,
+) -> tuple[Any, Any]:  # fmt: skip
     """Torque critic (18) relative to u_max and passivity critic (17) relative to p_ref [W], (B,) each.
 
     The torque critic asks for ``margin`` in reserve, the passivity critic for a hundredth of |v| |u_sc|. They are
-    zero where psi(u_des) >= 0, since nothing is corrected there.
+    zero where psi(u_des) >= 0, since nothing is corrected there, and where the filter does not act: with ``act_within``
+    in the spec the states may lie above its epsilon.
     """
-    row = least_row(rows)
+    active = torch.ones_like(rows.phi, dtype=torch.bool)
+    if spec.act_within is not None:
+        active = (rows.h <= spec.act_within) | (rows.phi <= spec.epsilon)
+    row = least_row(rows, active)
     psi = row.psi(u_des)[:, 0]
     Lg, w = row.Lg_phi[:, 0], row.w[:, 0]
     direction = Lg if metric == "torque" else w
     u_sc = -torch.minimum(psi, torch.zeros_like(psi))[:, None] * direction / ((Lg * direction).sum(-1) + _TINY)[:, None]
     u = u_des + u_sc
-    acts = (psi < 0.0).to(u.dtype)
+    acts = ((psi < 0.0) & active.any(-1)).to(u.dtype)
     torque = torch.relu(u.abs() / u_max - (1.0 - margin)).amax(-1) * acts
     power = (v * u_sc).sum(-1) - d_p
     size = v.norm(dim=-1) * u_sc.norm(dim=-1)

@@ -56,7 +56,7 @@ class PaperDescent(Descent):
         band = self.band
         rows, n = band.field.rows(self.params, rays, s), band.nominal(rays, s)
         torque, passivity = closed_form_critics(
-            rows, n.v, n.u_des, n.d_p, band.u_max, self.preset.metric, margin, self._p_ref
+            rows, n.v, n.u_des, n.d_p, band.u_max, self.preset.metric, margin, self._p_ref, band.spec
         )
         return rows, torque, passivity if self.kind == "pp-ncbf" else torch.zeros_like(passivity)
 
