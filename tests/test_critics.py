@@ -40,7 +40,7 @@ def network(request, problem, random_network) -> NumpyNetwork:
 
 @pytest.fixture(params=[(None, 0.025), (0.03, 0.1)], ids=["by phi", "by h"])
 def on_band(request, problem, network) -> tuple[Problem, Rays, torch.Tensor, BarrierRows]:
-    """A problem whose closed form acts on phi, or on some near rows above the band; rays, s and rows of states there."""
+    """A problem whose closed form acts on phi, or on near rows above the band; rays, s and rows of states there."""
     act_within, level = request.param
     spec = problem.robot.spec.barrier.model_copy(update={"act_within": act_within})
     field, rays = make_field(problem, network.kind), make_rays(problem, 600)
