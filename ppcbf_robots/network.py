@@ -12,7 +12,7 @@ Two forms:
   a bowl ``a (softplus(|s|² - c) - softplus(-c))`` of the scaled velocity ``s = b v / v_scale``, with ``a >= 0`` and
   weights b for each joint: they slow all motions and, without q, cannot be steep in it. All are smooth, zero with zero
   gradient at rest and convex in v, so ``v · ∂K/∂v >= K >= 0``: the corrections of the kinetic metric dissipate (see the
-  README's theory section).
+  README, Method in short).
   Its layers see q scaled to X and, as the dynamics do, the cosine and sine of every angle (``turns`` is 1 for angles
   and 0 for lengths and for the cos and sin of continuous joints).
 
