@@ -8,7 +8,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from ppcbf_robots.artefact import load_barrier
 from ppcbf_robots.barriers import Barrier
 from ppcbf_robots.cli.output import JsonOption, RobotArgument, WorldArgument
 from ppcbf_robots.cli.tasks import (
@@ -31,7 +30,7 @@ from ppcbf_robots.resources import portable
 from ppcbf_robots.results_file import Record
 from ppcbf_robots.specs import Array
 from ppcbf_robots.studies.tables import write_table
-from ppcbf_robots.studies.training import Training, check_folders
+from ppcbf_robots.studies.training import Training, barriers_of
 from ppcbf_robots.studies.variability import overlaps, variability_rows
 
 
@@ -63,8 +62,7 @@ def variability(
     records = run_tasks([training.task(problem) for training in trainings], out_dir, jobs, dask)
     found = ended(records)
     folders = [_folder(out_dir, record["key"]["seed"]) for record in found]
-    check_folders(found, folders)
-    barriers = [load_barrier(folder).barrier(problem) for folder in folders]
+    barriers = [stored.barrier(problem) for stored in barriers_of(found, folders)]
     rows = variability_rows(found, overlaps(problem, barriers, np.random.default_rng(0)))
     figures = _figures(problem, found, barriers, out_dir)
     files = [out_dir / RESULTS, *write_table(rows, out_dir), *figures]

@@ -28,7 +28,7 @@ from ppcbf_robots.problem import load_problem
 from ppcbf_robots.resources import portable
 from ppcbf_robots.results_file import Record
 from ppcbf_robots.studies.tables import cell
-from ppcbf_robots.studies.training import Training, check_folders
+from ppcbf_robots.studies.training import Training, barriers_of
 from ppcbf_robots.sweep import Task
 
 KEYS = ("converged", "volume_kept", "violations", "samples", "seconds", "reason")
@@ -64,7 +64,7 @@ def sweep(
             training = Training(portable(robot), portable(world), preset, chosen, seed, limit, folder)
             tasks[folder] = training.task(problem)
     records = run_tasks(list(tasks.values()), out_dir, jobs, dask)
-    check_folders(records, list(tasks))
+    barriers_of(records, list(tasks))  # or refuse
     rows = [_row(record, folder) for record, folder in zip(records, tasks, strict=True)]
     if json:
         emit_json({"rows": rows, "results": str(out_dir / RESULTS)})

@@ -70,7 +70,6 @@ def independent_band(
         v = domain.sample_v(rng, CHUNK)
         h, grad = problem.safety.first_order(q)
         free = np.flatnonzero(h.min(axis=-1) >= 0.0)
-        on = free
         if free.size:
             phi = least_phi(problem, barrier, q[free], h[free], grad[free], v[free, None])[:, 0]
             on = free[(phi >= 0.0) & (phi <= epsilon)][: count - found]

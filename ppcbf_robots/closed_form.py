@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ppcbf_robots.barriers import Barrier, BarrierRows
-from ppcbf_robots.filters import Box, Correction, FilterConfig, Status
+from ppcbf_robots.filters import Box, Correction, FilterConfig, Status, acts_on
 from ppcbf_robots.robot import Dynamics
 from ppcbf_robots.safety import SafetyRows
 from ppcbf_robots.specs import Array
@@ -26,10 +26,9 @@ class ClosedForm:
 
     def _active(self, rows: BarrierRows) -> Array:
         spec = self.barrier.spec
-        near = np.zeros_like(rows.h, dtype=bool) if spec.act_within is None else rows.h <= spec.act_within
-        if self.barrier.kind == "pp-cbf":
-            return np.ones_like(near) if spec.act_within is None else np.asarray(near)
-        return np.asarray(near | (rows.phi <= spec.epsilon))  # a state beyond the band must not pass unfiltered
+        if self.barrier.kind != "pp-cbf":
+            return np.asarray(acts_on(spec, rows.h, rows.phi))
+        return np.ones_like(rows.h, dtype=bool) if spec.act_within is None else np.asarray(rows.h <= spec.act_within)
 
     def correct(
         self,

@@ -90,10 +90,8 @@ class Ending:
             return text + "V does not fall, so it would not come to rest"
         if self.remaining is None:
             return text + f"V falls at {self.power:.2g} W: run longer (--duration)"
-        return (
-            text
-            + f"V falls at {self.power:.2g} W: run {max(self.remaining, 1.0):.0f} s longer (--duration) at this rate"
-        )
+        seconds = max(self.remaining, 1.0)
+        return text + f"V falls at {self.power:.2g} W: run {seconds:.0f} s longer (--duration) at this rate"
 
 
 def judge(

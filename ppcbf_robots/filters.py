@@ -103,9 +103,20 @@ def stays_slow(v: Any, Minv: Any, b: Any, u: Any, ahead: float, slow: Any) -> bo
     return found
 
 
+def acts_on(spec: BarrierSpec, h: Any, phi: Any) -> Any:
+    """Which rows the closed form of a barrier with K looks at: in the band or below it, and near ones if asked for."""
+    within = phi <= spec.epsilon
+    return within if spec.act_within is None else within | (h <= spec.act_within)
+
+
 def band_width(spec: BarrierSpec, kind: FilterKind) -> float:
-    """Largest phi [m/s] of the states that a filter of this kind is trained and checked on: where it acts."""
-    return spec.acting_width if kind == "closed-form" else spec.epsilon
+    """Largest phi [m/s] of the states that a filter of this kind is trained and checked on.
+
+    Up to there the closed form acts on rows that do not separate (:func:`acts_on`).
+    """
+    if kind == "qp" or spec.act_within is None:
+        return spec.epsilon
+    return max(spec.epsilon, spec.gamma * spec.act_within)
 
 
 def free_power(robot: RobotModel) -> float:

@@ -58,10 +58,9 @@ def known_barriers(problem: Problem, folders: Sequence[Path]) -> dict[str, Barri
     Raises:
         InputError: if a folder holds a barrier of another problem, or two have the same name.
     """
-    taken = (FREE, VIABLE)
     found: dict[str, Barrier] = {LB: problem.barrier("lb-cbf"), PP: problem.barrier("pp-cbf")}
     for folder in folders:
-        if folder.name in (*found, *taken):
+        if folder.name in (*found, FREE, VIABLE):
             raise InputError(f"--barrier: there is another set named '{folder.name}'; rename the folder")
         found[folder.name] = load_barrier(folder).barrier(problem)
     return found

@@ -98,11 +98,6 @@ class BarrierSpec(Spec):
     epsilon: Positive = 0.05  # [m/s], width of the band of eq. (21)
     act_within: Positive | None = None  # [m]: closed form acts where h <= this, too
 
-    @property
-    def acting_width(self) -> float:
-        """Largest phi [m/s] at which the closed form acts on a row that does not separate."""
-        return self.epsilon if self.act_within is None else max(self.epsilon, self.gamma * self.act_within)
-
 
 class SelfCollisionSpec(Spec):
     """Body spheres must not touch each other, but for neighbours and links whose collision the SRDF disables."""
@@ -200,7 +195,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def _decoded(content: bytes) -> str:
-    """Text with the line ends of this machine's; XML may say how it is encoded, all else is UTF-8."""
+    """Text whose lines end with a newline alone; XML may say how it is encoded, all else is UTF-8."""
     declared = _XML_ENCODING.match(content)
     text = content.decode(declared[1].decode() if declared else "utf-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ppcbf_robots.barriers import BarrierRows
-from ppcbf_robots.filters import FilterConfig, Metric
+from ppcbf_robots.filters import FilterConfig, Metric, acts_on
 from ppcbf_robots.learning.linear_program import Optimum, best_worst_row
 from ppcbf_robots.specs import BarrierSpec
 
@@ -46,7 +46,7 @@ def closed_form_critics(
     """
     active = torch.ones_like(rows.phi, dtype=torch.bool)
     if spec.act_within is not None:
-        active = (rows.h <= spec.act_within) | (rows.phi <= spec.epsilon)
+        active = acts_on(spec, rows.h, rows.phi)
     row = least_row(rows, active)
     psi = row.psi(u_des)[:, 0]
     Lg, w = row.Lg_phi[:, 0], row.w[:, 0]

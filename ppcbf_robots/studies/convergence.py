@@ -29,8 +29,7 @@ def convergence_rows(records: Sequence[Record]) -> list[Row]:
 
 
 def _row(preset: str, rate: float, exit_at: float, results: list[dict[str, Any]]) -> Row:
-    collapsed = [r for r in results if r["reason"].startswith("collapsed")]
-    converged = [r for r in results if (r["ended"] and r not in collapsed if exit_at else r["converged"])]
+    converged = [r for r in results if (r["ended"] and not _collapsed(r) if exit_at else r["converged"])]
     first_clean = [i for r in results for i in _clean_checks(r)[:1]]
     volumes = [r["volume_kept"] for r in results]
     paper_share, paper_steps = TABLE_1.get(rate, (None, None))
@@ -41,7 +40,7 @@ def _row(preset: str, rate: float, exit_at: float, results: list[dict[str, Any]]
         "clean_once": len(first_clean) / len(results),
         "first_clean": mean(first_clean),
         "converged": len(converged) / len(results),
-        "collapsed": len(collapsed) / len(results),
+        "collapsed": sum(map(_collapsed, results)) / len(results),
         "steps": mean([r["steps"] for r in converged]),
         "seconds": mean([r["seconds"] for r in results]),
         "violating": mean([m["torque"] + m["passivity"] for r in results for m in r["history"][-1:]]),
@@ -50,6 +49,10 @@ def _row(preset: str, rate: float, exit_at: float, results: list[dict[str, Any]]
         "paper_share": paper_share,
         "paper_steps": paper_steps,
     }
+
+
+def _collapsed(result: dict[str, Any]) -> bool:
+    return str(result["reason"]).startswith("collapsed")
 
 
 def _clean_checks(result: dict[str, Any]) -> list[int]:

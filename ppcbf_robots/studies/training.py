@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ppcbf_robots.artefact import load_barrier
+from ppcbf_robots.artefact import StoredBarrier, load_barrier
 from ppcbf_robots.errors import InputError
 from ppcbf_robots.learning.presets import Preset, PresetName, with_gamma
 from ppcbf_robots.problem import Problem, load_problem
@@ -21,14 +21,21 @@ from ppcbf_robots.sweep import Task
 KIND: Final = "pp-ncbf"
 
 
-def check_folders(records: Sequence[Record], folders: Sequence[Path]) -> None:
-    """InputError if a folder does not hold the barrier of its record, as when another sweep has written there since."""
+def barriers_of(records: Sequence[Record], folders: Sequence[Path]) -> list[StoredBarrier]:
+    """The barriers of the records with results, from the folders of all.
+
+    Raises:
+        InputError: if a folder holds the barrier of another training, as when another sweep has written there since.
+    """
+    barriers = []
     for record, folder in zip(records, folders, strict=True):
         if "result" in record:
-            found, expected = load_barrier(folder).data["training"], record["result"]
+            barriers.append(load_barrier(folder))
+            found, expected = barriers[-1].data["training"], record["result"]
             if (found["steps"], found["seconds"]) != (expected["steps"], round(expected["seconds"], 2)):
                 raise InputError(f"{folder}: holds the barrier of another training than the results say; "
                                  "give another --out")  # fmt: skip
+    return barriers
 
 
 @dataclass(frozen=True)
